@@ -1,0 +1,1 @@
+"""jaxreg: rigid point cloud registration in pure JAX."""

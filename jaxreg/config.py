@@ -1,0 +1,234 @@
+"""Every default of the library, in one place, and how files and the command line change it.
+
+A TOML file states deviations from the defaults only::
+
+    weights = "modelnet40"
+    [model]
+    k = 8
+
+``--model.k 12`` on the command line deviates from the file. The symbols of the paper stand in the
+documentation of each field.
+"""
+
+import dataclasses
+import difflib
+import tomllib
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The network (METHOD: stages and readings)."""
+
+    k: int = 5
+    """K, neighbours of a point in the features and in the inlier module (self excluded)."""
+    k_matching: int = 5
+    """K of the neighbourhood sum in Eq. 4."""
+    include_self: bool = False
+    """Put the point itself in front of its K neighbours (the predecessor does)."""
+    channels: tuple[int, ...] = (32, 32, 64, 128)
+    """Widths of the DGCNN layers."""
+    width: int = 256
+    """C, width of the local features."""
+    alpha: float = 0.7
+    """alpha of Eq. 5."""
+    one_nn: Literal["gather", "own", "self", "none"] = "gather"
+    """1-NN patch. `gather`: features of the 1-NN cloud are those of the same points in the input
+    cloud. `own`: graph and features are computed in the 1-NN cloud itself. `self`: every point is its
+    own 1-NN (control). `none`: single neighbourhood (the predecessor)."""
+    edge: Literal["vector", "length", "coordinates"] = "vector"
+    """e of Eq. 7: the edge vector, its length (invariant to rotation), or the raw neighbour
+    coordinates (the paper's ablation without geometric invariants)."""
+    angles: Literal["all", "next", "none"] = "all"
+    """Pairs (r, s) of the angles in Eq. 7: to every other edge, to the next edge, or no angle."""
+    inlier_network: Literal["paper", "predecessor"] = "paper"
+    """Eq. 9-11 as written, or the predecessor's convolution along the ordered neighbours."""
+    inlier_width: int = 8
+    """Width of the inlier networks' first layer; the second is twice as wide."""
+    n_inliers: int = 256
+    """N_c, correspondences kept by confidence (Eq. 12)."""
+    svd: Literal["top", "all"] = "top"
+    """Points of the weighted Procrustes: the top N_c (paper) or all of them (predecessor)."""
+    iterations: int = 3
+    """N_l, registration steps."""
+    bn_momentum: float = 0.9
+    """Share of the old running statistics that a training step keeps in BatchNorm."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """The four losses of Eq. 14-18, summed over points, averaged over pairs."""
+
+    global_consistency: float = 1.0
+    """Weight of L_gc (1 in the paper; 0 in its ablation)."""
+    gamma: float = 1.0
+    """Weight of L_in, dual neighbourhood consistency."""
+    rho: float = 1.0
+    """Weight of L_gs, geometric structure consistency."""
+    lambda_: float = 1.0
+    """Weight of L_sc, spatial consistency."""
+    beta: float = 0.01
+    """beta of the Huber function in L_gc, applied to squared distances."""
+    l_in: Literal["unsquared", "squared"] = "unsquared"
+    """L_in with Euclidean norms (paper) or squared: keypoint term + neighbour term / K."""
+    l_sc: Literal["G", "F"] = "G"
+    """Map whose peak L_sc sharpens: the dual neighbourhood map (paper) or the final map."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PairConfig:
+    """How two clouds to register are made from one shape (METHOD section 4)."""
+
+    points: int = 1024
+    """Points taken from a shape before the crop."""
+    crop: Literal["viewpoint", "half-space", "none"] = "viewpoint"
+    """Keep the points nearest to one far viewpoint, or on one side of a plane with a random normal."""
+    kept: int = 768
+    """Points of each cloud after the crop."""
+    independent_crops: bool = False
+    """Crop each cloud on its own instead of sharing one viewpoint or plane."""
+    sampling: Literal["copy", "disjoint"] = "copy"
+    """`copy`: both clouds hold the same points. `disjoint`: they share none; each takes its own
+    half of the shape's points (or its own draw from a dense cloud)."""
+    rotation: Literal["euler", "axis-angle", "full"] = "euler"
+    """Three Euler angles, an axis and an angle, or a uniformly random rotation."""
+    rotation_max_deg: float = 45.0
+    """Upper end of each angle's range, which starts at 0."""
+    translation_max: float = 0.5
+    """Half width of the range of each coordinate of the translation."""
+    jitter: float = 0.0
+    """Standard deviation of the noise on every point."""
+    jitter_clip: float = 0.05
+    """Largest magnitude of that noise."""
+    outliers: int = 0
+    """Points appended to each cloud after the crop: random points of it + N(0, 0.5) clipped to 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Which shapes."""
+
+    name: Literal["modelnet40", "shapes", "seven_scenes", "icl_nuim"] = "modelnet40"
+    """Source: `shapes` is procedural and needs no file."""
+    train_categories: Literal["all", "first20", "last20"] = "all"
+    """ModelNet40 labels to train on."""
+    test_categories: Literal["all", "first20", "last20"] = "all"
+    """ModelNet40 labels to test on."""
+    validation_share: float = 0.05
+    """Share of the training shapes held out to choose the best checkpoint."""
+    train_shapes: int = 2048
+    """Procedural shapes to train on."""
+    test_shapes: int = 256
+    """Procedural shapes to test on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Optimisation."""
+
+    steps: int = 6000
+    """Optimiser steps."""
+    batch: int = 8
+    """Pairs in a step."""
+    learning_rate: float = 1e-3
+    """Peak of the schedule: linear warm-up, then cosine decay to `final_learning_rate`."""
+    final_learning_rate: float = 1e-5
+    """End of the schedule."""
+    warmup: int = 100
+    """Steps of warm-up."""
+    weight_decay: float = 1e-4
+    """L2 term inside Adam (the predecessor's)."""
+    clip: float = 1.0
+    """Largest global norm of the gradient, in units of its running mean."""
+    ema: float = 0.99
+    """Decay of the running mean of the weights that is validated and released."""
+    validate_every: int = 250
+    """Steps between validations (and checkpoints)."""
+    validation_pairs: int = 64
+    """Pairs of a validation."""
+    seed: int = 0
+    """The one seed; everything random derives from it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """All of it."""
+
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    pairs: PairConfig = PairConfig()
+    """Pairs to train and to test on."""
+    test_pairs: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Fields of `pairs` that differ at test time only (TOML table `[test_pairs]`)."""
+    data: DataConfig = DataConfig()
+    train: TrainConfig = TrainConfig()
+    weights: str = ""
+    """Released weights that `evaluate.py` uses when no checkpoint is given."""
+
+
+def load_config(path: str | Path) -> Config:
+    """The configuration of a TOML file of deviations from the defaults.
+
+    Raises:
+      ValueError: the file is missing or not TOML, or it names an unknown section or field (the
+        nearest known name is given), or a value has the wrong type.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"no configuration file at {path}: see configs/ for the ones given.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} is not valid TOML: {error}.") from None
+    return from_dict(content, where=str(path))
+
+
+def from_dict(content: dict[str, Any], *, where: str = "configuration") -> Config:
+    """The configuration of a nested dict of deviations; errors as `load_config`."""
+    config = _build(Config, content, where)
+    test_pairs(config)
+    return config
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """Every field as a nested dict of plain values, which `from_dict` reads back."""
+    return dataclasses.asdict(config)
+
+
+def test_pairs(config: Config) -> PairConfig:
+    """How pairs are made at test time: `pairs` with the deviations of `[test_pairs]`."""
+    return _build(PairConfig, dataclasses.asdict(config.pairs) | config.test_pairs, "[test_pairs]")
+
+
+def _build(cls: type, content: dict[str, Any], where: str) -> Any:
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for key, value in content.items():
+        if key not in hints:
+            near = difflib.get_close_matches(key, hints, n=1, cutoff=0.0)
+            raise ValueError(f"{where}: unknown key '{key}'; did you mean '{near[0]}'?")
+        values[key] = _convert(hints[key], value, f"{where}: '{key}'")
+    return cls(**values)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ValueError(f"{where} is a section: write [{where.split()[-1]}] and its fields.")
+        return _build(hint, value, where)
+    if typing.get_origin(hint) is Literal:
+        choices = typing.get_args(hint)
+        if value not in choices:
+            raise ValueError(f"{where} must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+        return value
+    if typing.get_origin(hint) is tuple:
+        return tuple(value)
+    if typing.get_origin(hint) is dict:
+        return dict(value)
+    if hint is float and type(value) is int:
+        return float(value)
+    if type(value) is not hint:
+        raise ValueError(f"{where} must be {hint.__name__}, got {value!r}.")
+    return value

@@ -1,0 +1,93 @@
+"""Neighbours inside one cloud and between two, by exact differences of coordinates.
+
+The product form ``|x|^2 - 2 x.y + |y|^2`` is not used for points: a thousand units away from the
+origin it names the wrong neighbour every second time.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+def squared_distances(
+    points: Float[Array, "n 3"], others: Float[Array, "m 3"]
+) -> Float[Array, "n m"]:
+    """``d[i, j] = |points[i] - others[j]|^2``."""
+    differences = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
+    return sum(d * d for d in differences)
+
+
+def without_padding(
+    points: Float[Array, "n 3"], mask: Bool[Array, "n"] | None
+) -> Float[Array, "n 3"]:
+    """`points` with every padded row set to zero, so that a NaN there can reach nothing."""
+    return points if mask is None else jnp.where(mask[:, None], points, 0)
+
+
+def knn(
+    points: Float[Array, "n 3"], k: int, mask: Bool[Array, "n"] | None = None
+) -> Int[Array, "n k"]:
+    """The `k` nearest other points of every point, nearest first (the graph N_o).
+
+    If ``idx[i, r] = j`` then ``points[j]`` is the (r+1)-th nearest point of ``points[i]`` with
+    ``j != i``. Coincident points are neighbours of each other at distance 0. Equal distances are
+    ordered by coordinates, not by row, so that permuting the points permutes the graph. Where fewer
+    than `k` valid others exist, a point fills the rest of its list with itself.
+
+    Raises:
+      ValueError: `points` is not ``(n, 3)``, or not ``1 <= k < n``.
+    """
+    _check_points(points)
+    n = points.shape[0]
+    if not 1 <= k < n:
+        raise ValueError(
+            f"k = {k} neighbours do not exist in a cloud of n = {n} points: "
+            "choose 1 <= k < n, or give more points."
+        )
+    points = jax.lax.stop_gradient(without_padding(points, mask))
+    order = jnp.lexsort(points.T)
+    distance = squared_distances(points, points[order])
+    excluded = order[None, :] == jnp.arange(n)[:, None]
+    if mask is not None:
+        excluded = excluded | ~mask[order][None, :]
+    # The barrier keeps XLA from merging later slices into the call, which would turn the
+    # fast selection into a full sort of every row.
+    negative, column = jax.lax.optimization_barrier(
+        jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
+    )
+    index = jnp.where(jnp.isneginf(negative), jnp.arange(n)[:, None], order[column])
+    return index.astype(jnp.int32)
+
+
+def nearest_neighbor(
+    points: Float[Array, "n 3"], mask: Bool[Array, "n"] | None = None
+) -> Int[Array, "n"]:
+    """Index of the nearest other point: ``points[idx]`` is the 1-NN cloud (Eq. 1-2, i != m).
+
+    Raises:
+      ValueError: `points` is not ``(n, 3)``, or has fewer than two rows.
+    """
+    return knn(points, 1, mask)[:, 0]
+
+
+def nearest_in(
+    points: Float[Array, "n 3"],
+    others: Float[Array, "m 3"],
+    mask: Bool[Array, "m"] | None = None,
+) -> Int[Array, "n"]:
+    """Index into `others` of the nearest valid one of every point (the lowest index of equals)."""
+    distance = jax.lax.stop_gradient(squared_distances(points, without_padding(others, mask)))
+    if mask is not None:
+        distance = jnp.where(mask[None, :], distance, jnp.inf)
+    return jnp.argmin(distance, axis=1).astype(jnp.int32)
+
+
+def _check_points(points: Array) -> None:
+    try:
+        chex.assert_shape(points, (None, 3))
+    except AssertionError:
+        raise ValueError(
+            f"points must have shape (n, 3), got {points.shape}: give one cloud, "
+            "and use jax.vmap for a batch."
+        ) from None

@@ -1,0 +1,41 @@
+"""Elementary functions that stay right, and differentiable, at the points where they usually break.
+
+Every function here has a finite derivative everywhere. Where the true one does not exist (a norm at
+the origin, an angle of parallel vectors) it is zero, which is a valid subgradient of each of them.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """``sqrt(max(x, 0))`` whose derivative at ``x <= 0`` is 0 instead of infinite."""
+    positive = x > 0
+    # The double `where`: the branch that is not taken must not see a zero either, since its
+    # infinite derivative times the zero of the outer `where` would be NaN.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+    """Euclidean norm along `axis`, with derivative 0 at the origin."""
+    return safe_sqrt(jnp.sum(x * x, axis=axis))
+
+
+def _unit_scale(x: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """`x` with its largest coordinate at magnitude 1, so that no square under- or overflows."""
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
+    return x / jnp.where(largest > 0, largest, 1)
+
+
+def included_angle(u: Float[Array, "... 3"], v: Float[Array, "... 3"]) -> Float[Array, "..."]:
+    """Angle between `u` and `v` in radians, ``atan2(|u x v|, u . v)`` (Eq. 8), in [0, pi].
+
+    Accurate at 0 and at pi, where ``arccos`` loses half of its digits. A zero vector makes an angle
+    of 0 with everything. Leading axes broadcast.
+    """
+    # An angle does not depend on lengths, so the scale may be a constant of the derivative.
+    u, v = _unit_scale(u), _unit_scale(v)
+    cross, dot = safe_norm(jnp.cross(u, v)), jnp.sum(u * v, axis=-1)
+    degenerate = (cross == 0) & (dot == 0)
+    return jnp.where(degenerate, 0, jnp.arctan2(cross, jnp.where(degenerate, 1, dot)))

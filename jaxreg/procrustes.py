@@ -1,0 +1,94 @@
+"""Weighted Procrustes: the rigid transform between corresponding points, with its own derivative.
+
+The derivative of the singular value decomposition divides by *differences* of singular values and is
+NaN for a cube, a cylinder or a line. The rotation itself is smooth there: its derivative divides by
+*sums* of singular values, which vanish only where the best rotation is not unique.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Float
+
+from jaxreg.types import RigidTransform
+
+
+def weighted_procrustes(
+    source: Float[Array, "n 3"], reference: Float[Array, "n 3"], weights: Float[Array, "n"]
+) -> RigidTransform:
+    """The rigid transform that minimises ``sum_i w_i |R x_i + t - y_i|^2`` (Eq. 13).
+
+    `source[i]` corresponds to `reference[i]`. Weights need no normalisation; negative ones count as
+    zero. R is a rotation (det +1) for every input, mirrored and degenerate ones included. All
+    weights zero give the identity; a single positive weight gives ``R = I, t = y - x``. Where the
+    best rotation is not unique (a line, a point) R is one of the best, and the derivative is that of
+    least norm. First and higher derivatives are finite everywhere.
+
+    Raises:
+      ValueError: the shapes are not ``(n, 3), (n, 3), (n,)``.
+    """
+    if source.shape != reference.shape or source.shape != (*weights.shape, 3):
+        raise ValueError(
+            "weighted_procrustes needs source (n, 3), reference (n, 3) and weights (n,), got "
+            f"{source.shape}, {reference.shape} and {weights.shape}."
+        )
+    weights = jnp.maximum(weights, 0)
+    largest = jnp.max(weights, initial=0)
+    # Only the proportions of the weights matter; this keeps tiny and huge ones in range.
+    weights = weights / jnp.where(largest > 0, largest, 1)
+    total = jnp.sum(weights)
+    share = (weights / jnp.where(total > 0, total, 1))[:, None]
+    source_centroid = jnp.sum(share * source, axis=0)
+    reference_centroid = jnp.sum(share * reference, axis=0)
+    covariance = jnp.matmul(
+        (share * (source - source_centroid)).T,
+        reference - reference_centroid,
+        precision=Precision.HIGHEST,
+    )
+    rotation = special_procrustes(covariance)
+    rotated = jnp.matmul(rotation, source_centroid, precision=Precision.HIGHEST)
+    return RigidTransform(rotation, reference_centroid - rotated)
+
+
+def special_procrustes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The rotation R that maximises ``trace(R H)`` for a covariance ``H = sum_i w_i x_i y_i^T``."""
+    # R does not depend on the scale of H, so the scale may be a constant of the derivative.
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(covariance)))
+    return _rotation(covariance / jnp.where(scale > 0, scale, 1))
+
+
+@jax.custom_jvp
+def _rotation(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    u, _, vt = jnp.linalg.svd(covariance)
+    sign = jnp.linalg.det(jnp.matmul(vt.T, u.T, precision=Precision.HIGHEST))
+    signs = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), jnp.sign(sign)])
+    rotation = jnp.matmul(vt.T * signs, u.T, precision=Precision.HIGHEST)
+    # One Newton step towards the nearest orthogonal matrix: float32 factors are orthogonal to
+    # 1e-6 only, which a chain of iterations would add up.
+    gram = jnp.matmul(rotation.T, rotation, precision=Precision.HIGHEST)
+    return jnp.matmul(
+        rotation, 1.5 * jnp.eye(3, dtype=gram.dtype) - 0.5 * gram, precision=Precision.HIGHEST
+    )
+
+
+@_rotation.defjvp
+def _rotation_jvp(primals, tangents):
+    """``dR = [w]_x R`` with ``(trace(A) I - A) w = x`` and ``A = R H``.
+
+    At the optimum A is symmetric. Differentiating that, with ``dR = Omega R`` and Omega skew, gives
+    ``Omega A + A Omega = (R dH)^T - R dH``, and for symmetric A the left side is the skew matrix of
+    ``(trace(A) I - A) w``. Its eigenvalues are the sums of two (signed) singular values. The pseudo-
+    inverse leaves out those that vanish; it has derivatives of its own, of every order.
+    """
+    (covariance,), (covariance_dot,) = primals, tangents
+    rotation = _rotation(covariance)
+    a = jnp.matmul(rotation, covariance, precision=Precision.HIGHEST)
+    a = (a + a.T) / 2
+    system = jnp.trace(a) * jnp.eye(3, dtype=a.dtype) - a
+    skew = jnp.matmul(rotation, covariance_dot, precision=Precision.HIGHEST)
+    skew = skew.T - skew
+    axial = jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+    tolerance = 16 * jnp.finfo(a.dtype).eps
+    inverse = jnp.linalg.pinv(system, rtol=tolerance, hermitian=True)
+    omega = jnp.matmul(inverse, axial, precision=Precision.HIGHEST)
+    return rotation, jnp.cross(omega[None, :], rotation.T).T
