@@ -160,8 +160,8 @@ class Config:
     loss: LossConfig = LossConfig()
     pairs: PairConfig = PairConfig()
     """Pairs to train and to test on."""
-    test_pairs: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Fields of `pairs` that differ at test time only (TOML table `[test_pairs]`)."""
+    test_pairs: PairConfig = PairConfig()
+    """Pairs to test on. A file's `[test_pairs]` starts from its `[pairs]` and states what differs."""
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
     weights: str = ""
@@ -187,19 +187,13 @@ def load_config(path: str | Path) -> Config:
 
 def from_dict(content: dict[str, Any], *, where: str = "configuration") -> Config:
     """The configuration of a nested dict of deviations; errors as `load_config`."""
-    config = _build(Config, content, where)
-    test_pairs(config)
-    return config
+    merged = dict(content.get("pairs", {})) | dict(content.get("test_pairs", {}))
+    return _build(Config, content | {"test_pairs": merged}, where)
 
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Every field as a nested dict of plain values, which `from_dict` reads back."""
     return dataclasses.asdict(config)
-
-
-def test_pairs(config: Config) -> PairConfig:
-    """How pairs are made at test time: `pairs` with the deviations of `[test_pairs]`."""
-    return _build(PairConfig, dataclasses.asdict(config.pairs) | config.test_pairs, "[test_pairs]")
 
 
 def _build(cls: type, content: dict[str, Any], where: str) -> Any:
@@ -225,8 +219,6 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return value
     if typing.get_origin(hint) is tuple:
         return tuple(value)
-    if typing.get_origin(hint) is dict:
-        return dict(value)
     if hint is float and type(value) is int:
         return float(value)
     if type(value) is not hint:
