@@ -1,0 +1,58 @@
+"""Geometry of a neighbourhood: edges to the neighbours and the angles between them (Eq. 7-8)."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxreg.numerics import included_angle, safe_norm
+
+
+def edges(
+    points: Float[Array, "n 3"],
+    neighbors: Int[Array, "n k"],
+    *,
+    kind: Literal["vector", "length", "coordinates"] = "vector",
+) -> Float[Array, "n k d"]:
+    """``e_{i,k}``: the edge ``p_i - p_k``, its length (d = 1), or ``p_k`` itself (an ablation).
+
+    Only the length is invariant to rotation; the vector is invariant to translation.
+    """
+    if kind == "coordinates":
+        return points[neighbors]
+    vectors = points[:, None] - points[neighbors]
+    return safe_norm(vectors)[..., None] if kind == "length" else vectors
+
+
+def included_angles(
+    vectors: Float[Array, "n k 3"], *, pairs: Literal["all", "next", "none"] = "all"
+) -> Float[Array, "n k a"]:
+    """Angles in radians between the K edges of each point (Eq. 8), invariant to rigid motion.
+
+    `all`: ``a[i, r, s]`` is the angle of edges r and s (a = K; 0 on the diagonal). `next`:
+    ``a[i, r, 0]`` is the angle of edges r and r + 1 modulo K (a = 1). `none`: a = 0.
+    """
+    if pairs == "none":
+        return jnp.zeros((*vectors.shape[:2], 0), vectors.dtype)
+    if pairs == "next":
+        return included_angle(vectors, jnp.roll(vectors, -1, axis=1))[..., None]
+    k = vectors.shape[1]
+    rows, columns = jnp.triu_indices(k, 1)
+    # Half of the angles, since a[r, s] = a[s, r] and a[r, r] = 0.
+    half = included_angle(vectors[:, rows], vectors[:, columns])
+    zero = jnp.zeros((*vectors.shape[:1], k, k), vectors.dtype)
+    upper = zero.at[:, rows, columns].set(half)
+    return upper + jnp.swapaxes(upper, 1, 2)
+
+
+def geometric_structure(
+    points: Float[Array, "n 3"],
+    neighbors: Int[Array, "n k"],
+    *,
+    edge: Literal["vector", "length", "coordinates"] = "vector",
+    angles: Literal["all", "next", "none"] = "all",
+) -> Float[Array, "n k d"]:
+    """``concat(e_{i,k}, a_{r,s})`` of every neighbour, the input of f_theta (Eq. 9)."""
+    vectors = edges(points, neighbors)
+    parts = [edges(points, neighbors, kind=edge), included_angles(vectors, pairs=angles)]
+    return jnp.concatenate(parts, axis=-1)
