@@ -1,0 +1,50 @@
+"""One data set of an HDF5 file, read whole and checked: every fault is one `ValueError`."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+
+def read(path: Path, key: str) -> np.ndarray:
+    """The array under `key`.
+
+    Raises:
+      ValueError: the file is missing, not HDF5 or truncated, or holds no array under `key`.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} is missing: download the data set again, or correct the list.")
+    try:
+        with h5py.File(path, "r") as file:
+            if key not in file:
+                raise ValueError(
+                    f"{path} has no key '{key}', only {sorted(file)}: is it from this data set?"
+                )
+            return np.asarray(file[key][()])
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read as HDF5 ({error}): it is truncated or of another kind; "
+            "download it again."
+        ) from None
+
+
+def read_clouds(path: Path, key: str) -> np.ndarray:
+    """The clouds (n, P, 3) under `key` as float32.
+
+    Raises:
+      ValueError: as `read`, or the array is not (n, P, 3) of finite numbers with n, P > 0.
+    """
+    clouds = read(path, key)
+    if clouds.ndim != 3 or clouds.shape[2] != 3 or clouds.size == 0 or clouds.dtype.kind != "f":
+        raise ValueError(
+            f"{path}: '{key}' must be float (n, P, 3) with n, P > 0, got {clouds.dtype} "
+            f"{clouds.shape}: download the file again."
+        )
+    finite = np.isfinite(clouds)
+    if not finite.all():
+        row, point = np.argwhere(~finite)[0][:2]
+        raise ValueError(
+            f"{path}: '{key}' holds a non-finite number in row {row}, point {point}: "
+            "download the file again, or leave that row out."
+        )
+    return clouds.astype(np.float32)

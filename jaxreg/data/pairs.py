@@ -1,0 +1,228 @@
+"""Two clouds to register, made from one shape, on device: a pure function of a key and a cloud.
+
+The order is: sample, move the reference, crop, shuffle, jitter, append outliers. Every stage draws
+from a key of its own, in float32, so that switching one stage on (outliers, say) changes nothing in
+the others, and the same key gives the same pair with and without 64-bit mode.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxreg import rigid
+from jaxreg.config import PairConfig
+from jaxreg.neighbors import without_padding
+from jaxreg.types import Pair, PointCloud, RigidTransform
+
+_VIEWPOINT = 500.0  # Each coordinate of the far viewpoint, up to U[0, 1] and one common sign.
+_OUTLIER_STD, _OUTLIER_CLIP = 0.5, 1.0
+
+
+class _Keys(NamedTuple):
+    sampling: PRNGKeyArray
+    pose: PRNGKeyArray
+    crop: PRNGKeyArray
+    source: PRNGKeyArray
+    reference: PRNGKeyArray
+
+
+def pair_sizes(config: PairConfig, shape_points: int) -> tuple[int, int]:
+    """Static sizes ``(n, m)`` of source and reference for shapes of `shape_points` points.
+
+    Raises:
+      ValueError: the shape has too few points for `points` or `kept`, or a size is not positive.
+    """
+    available = _available(config, shape_points)
+    if config.crop == "none":
+        kept = available
+    elif 1 <= config.kept <= available:
+        kept = config.kept
+    else:
+        raise ValueError(
+            f"kept = {config.kept} points cannot remain of the {available} that "
+            f"sampling = '{config.sampling}' takes from a shape of {shape_points}: choose "
+            f"1 <= kept <= {available}, crop = 'none', or shapes with more points."
+        )
+    if config.outliers < 0:
+        raise ValueError(f"outliers = {config.outliers} is negative: choose 0 or more.")
+    return kept + config.outliers, kept + config.outliers
+
+
+def make_pair(
+    key: PRNGKeyArray,
+    shape: Float[Array, "p 3"],
+    config: PairConfig,
+    shape_mask: Bool[Array, "p"] | None = None,
+) -> Pair:
+    """A source, a reference and the transform between them, ``reference = R source + t``.
+
+    `config` is static; vmap over keys and shapes for a batch. The masks are True everywhere unless
+    `shape_mask` leaves fewer valid points than a cloud has rows: no crop prefers padding to a valid
+    point, and the rows are then valid points of the shape, padding, outliers, in this order.
+
+    Crops (METHOD section 4). `viewpoint` keeps the points nearest to one far viewpoint, the *same*
+    for both clouds although the reference has moved already, so the clouds overlap in part.
+    `half-space` keeps the points farthest along a random direction; a shared direction is fixed in
+    the source's frame and turns with the reference, so the same physical part remains in both
+    clouds. With `independent_crops` each cloud has a viewpoint or direction of its own.
+
+    Raises:
+      ValueError: the shape is not (p, 3), or the sizes do not fit: see `pair_sizes`.
+    """
+    if shape.ndim != 2 or shape.shape[1] != 3:
+        raise ValueError(f"shape must be (p, 3), got {shape.shape}: use jax.vmap for a batch.")
+    pair_sizes(config, shape.shape[0])
+    keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
+    mask = jnp.ones(shape.shape[0], bool) if shape_mask is None else shape_mask
+    shape = PointCloud(without_padding(shape, shape_mask), mask)
+    transform = _draw_transform(keys.pose, config, shape.points.dtype)
+    source, still = _draw_clouds(keys.sampling, shape, config)
+    reference = still._replace(points=rigid.apply(transform, still.points))
+    scores = _crop_scores(keys.crop, source, still, reference, config)
+    source = _finish(keys.source, source, scores[0], config)
+    reference = _finish(keys.reference, reference, scores[1], config)
+    return Pair(source, reference, transform)
+
+
+def _available(config: PairConfig, shape_points: int) -> int:
+    """Points of each cloud before the crop."""
+    if config.sampling == "disjoint":
+        available = min(config.points, shape_points // 2)
+    else:
+        available = config.points
+    if not 1 <= available <= shape_points:
+        raise ValueError(
+            f"points = {config.points} cannot be taken from a shape of {shape_points} points with "
+            f"sampling = '{config.sampling}': choose another `points`, or shapes with more points."
+        )
+    return available
+
+
+def _draw_transform(key: PRNGKeyArray, config: PairConfig, dtype) -> RigidTransform:
+    """Angles and translation as drawn in float32, composed in `dtype`."""
+    rotation_key, translation_key = jax.random.split(key)
+    half = config.translation_max
+    translation = jax.random.uniform(translation_key, (3,), jnp.float32, -half, half)
+    return RigidTransform(_draw_rotation(rotation_key, config, dtype), translation.astype(dtype))
+
+
+def _draw_rotation(key: PRNGKeyArray, config: PairConfig, dtype) -> Float[Array, "3 3"]:
+    """`euler`: R = Rx Ry Rz of three angles U[0, max]; `axis-angle`; `full`: uniform on SO(3)."""
+    angle_key, axis_key = jax.random.split(key)
+    largest = jnp.float32(jnp.deg2rad(config.rotation_max_deg))
+    angles = jax.random.uniform(angle_key, (3,), jnp.float32, 0.0, largest).astype(dtype)
+    normal = jax.random.normal(axis_key, (4,), jnp.float32).astype(dtype)
+    if config.rotation == "full":
+        rotation = Rotation.from_quat(normal / jnp.linalg.norm(normal))
+    elif config.rotation == "axis-angle":
+        rotation = Rotation.from_rotvec(angles[0] * normal[:3] / jnp.linalg.norm(normal[:3]))
+    else:
+        # Lower case is extrinsic: about z first, about x last.
+        rotation = Rotation.from_euler("zyx", angles[::-1])
+    return rotation.as_matrix().astype(dtype)
+
+
+def _draw_clouds(
+    key: PRNGKeyArray, shape: PointCloud, config: PairConfig
+) -> tuple[PointCloud, PointCloud]:
+    """The two clouds before any motion: the same points, or two random draws that share none."""
+    available = _available(config, shape.mask.shape[0])
+    if config.sampling == "copy":
+        cloud = _take(shape, jnp.argsort(~shape.mask, stable=True)[:available])
+        return cloud, cloud
+    order = _shuffled(key, shape.mask)
+    # Every other rank of the order, so that the valid points of a padded shape are halved too.
+    return _take(shape, order[0::2][:available]), _take(shape, order[1::2][:available])
+
+
+def _crop_scores(
+    key: PRNGKeyArray,
+    source: PointCloud,
+    still: PointCloud,
+    reference: PointCloud,
+    config: PairConfig,
+) -> tuple[Float[Array, "n"] | None, Float[Array, "n"] | None]:
+    """Which points a crop keeps: those of the largest score. `still` is the unmoved reference."""
+    if config.crop == "none":
+        return None, None
+    first, second = jax.random.split(key)
+    second = second if config.independent_crops else first
+    if config.crop == "viewpoint":
+        return _nearness(source, _draw_viewpoint(first)), _nearness(
+            reference, _draw_viewpoint(second)
+        )
+    return _along(source, _draw_direction(first)), _along(still, _draw_direction(second))
+
+
+def _draw_viewpoint(key: PRNGKeyArray) -> Float[Array, "3"]:
+    """``+-(500, 500, 500) + U[0, 1]^3``, one sign for all three axes."""
+    sign_key, offset_key = jax.random.split(key)
+    sign = jax.random.rademacher(sign_key, (), jnp.float32)
+    return sign * _VIEWPOINT + jax.random.uniform(offset_key, (3,), jnp.float32)
+
+
+def _nearness(cloud: PointCloud, viewpoint: Float[Array, "3"]) -> Float[Array, "n"]:
+    """Order by distance to the viewpoint: ``(2 p.v - |p|^2) / 2|v|``, the nearest largest.
+
+    Expanded and without the constant |v|^2, beside which float32 would round p away.
+    """
+    viewpoint = viewpoint.astype(cloud.points.dtype)
+    far = jnp.linalg.norm(viewpoint)
+    along = jnp.matmul(cloud.points, viewpoint / far, precision=Precision.HIGHEST)
+    return along - jnp.sum(cloud.points**2, axis=1) / (2 * far)
+
+
+def _draw_direction(key: PRNGKeyArray) -> Float[Array, "3"]:
+    return jax.random.normal(key, (3,), jnp.float32)
+
+
+def _along(cloud: PointCloud, direction: Float[Array, "3"]) -> Float[Array, "n"]:
+    direction = direction.astype(cloud.points.dtype)
+    return jnp.matmul(cloud.points, direction, precision=Precision.HIGHEST)
+
+
+def _finish(
+    key: PRNGKeyArray, cloud: PointCloud, score: Float[Array, "n"] | None, config: PairConfig
+) -> PointCloud:
+    """Crop by score, shuffle, jitter, append outliers."""
+    order_key, jitter_key, outlier_key = jax.random.split(key, 3)
+    if score is not None:
+        score = jnp.where(cloud.mask, score, -jnp.inf)
+        cloud = _take(cloud, jax.lax.top_k(score, config.kept)[1])
+    cloud = _take(cloud, _shuffled(order_key, cloud.mask))
+    if config.jitter > 0:
+        noise = _noise(jitter_key, cloud.points, config.jitter, config.jitter_clip)
+        cloud = cloud._replace(points=cloud.points + noise)
+    return _append_outliers(outlier_key, cloud, config.outliers) if config.outliers else cloud
+
+
+def _append_outliers(key: PRNGKeyArray, cloud: PointCloud, count: int) -> PointCloud:
+    """`count` further points: random valid points of the cloud + N(0, 0.5), clipped to +-1."""
+    index_key, noise_key = jax.random.split(key)
+    valid = jnp.maximum(jnp.sum(cloud.mask, dtype=jnp.int32), 1)
+    added = _take(cloud, jax.random.randint(index_key, (count,), 0, valid, jnp.int32))
+    points = added.points + _noise(noise_key, added.points, _OUTLIER_STD, _OUTLIER_CLIP)
+    return PointCloud(
+        jnp.concatenate([cloud.points, points]), jnp.concatenate([cloud.mask, added.mask])
+    )
+
+
+def _noise(
+    key: PRNGKeyArray, points: Float[Array, "n 3"], std: float, clip: float
+) -> Float[Array, "n 3"]:
+    noise = std * jax.random.normal(key, points.shape, jnp.float32)
+    return jnp.clip(noise, -clip, clip).astype(points.dtype)
+
+
+def _shuffled(key: PRNGKeyArray, mask: Bool[Array, "n"]) -> Int[Array, "n"]:
+    """A random order of the rows, the valid ones first."""
+    rank = jax.random.uniform(key, mask.shape, jnp.float32)
+    return jnp.argsort(jnp.where(mask, rank, 1.0))
+
+
+def _take(cloud: PointCloud, index: Int[Array, "m"]) -> PointCloud:
+    return PointCloud(cloud.points[index], cloud.mask[index])
