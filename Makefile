@@ -1,0 +1,59 @@
+# Needs Python >= 3.11, make and a package index, nothing else. `make help` lists the targets.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+CHECKED := jaxreg tests $(wildcard *.py benchmarks examples)
+export JAX_PLATFORMS ?= cpu
+
+.PHONY: help demo test slow lint fuzz mutants tables baselines clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
+
+demo: $(VENV)/.installed  ## train on procedural shapes, evaluate, draw a pair (8 minutes, 2 cores)
+	$(BIN)/python train.py configs/synthetic_cpu.toml --workdir runs/demo
+	$(BIN)/python evaluate.py configs/synthetic_cpu.toml --checkpoint runs/demo --picture runs/demo/pair.png
+
+test: $(VENV)/.installed-dev  ## run the tests and report the coverage (10 minutes, 2 cores)
+	$(BIN)/python -m pytest -n 2 -m "not slow" --cov --cov-report=term
+
+slow: $(VENV)/.installed-dev  ## run the tests that `make test` leaves out
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.installed-dev  ## style, import order between the rooms, types
+	$(BIN)/ruff check $(CHECKED)
+	$(BIN)/ruff format --check $(CHECKED)
+	$(BIN)/lint-imports
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+fuzz: $(VENV)/.installed-dev  ## the tests with fresh seeds and many more examples
+	$(BIN)/python -m pytest -n 2 -m "not slow" --hypothesis-profile=fuzz --seed=random
+
+mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
+	$(BIN)/python tests/mutants.py
+
+baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
+
+tables: $(VENV)/.installed-baselines  ## every row of RESULTS.md that has weights
+	$(BIN)/python benchmarks/tables.py
+
+clean:  ## remove the environment, caches and runs
+	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*
+	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "jaxreg needs Python >= 3.11, and $(PYTHON) is older: make PYTHON=/path/to/python ..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-baselines: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[baselines]"
+	@touch $@ $(VENV)/.installed

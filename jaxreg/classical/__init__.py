@@ -1,0 +1,1 @@
+"""Registration without learning, by the libraries that people use, on the same pairs."""
