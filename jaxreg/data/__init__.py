@@ -1,0 +1,118 @@
+"""Shapes to make pairs from: the one way in to every source of data."""
+
+import os
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from jaxreg.config import DataConfig
+from jaxreg.data import icl_nuim, modelnet, seven_scenes, shapes
+from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
+
+__all__ = ["Split", "data_root", "load_shapes", "make_pair", "make_pair_from_scans", "pair_sizes"]
+
+Split = Literal["train", "validation", "test"]
+
+
+def data_root(
+    argument: str | Path | None = None, config_path: str | Path | None = None
+) -> Path | None:
+    """The folder of the data sets: `argument` (--data-root), else $JAXREG_DATA, else data/.
+
+    data/ is looked for beside the configuration file. None if there is no such folder and nothing
+    else was asked for.
+
+    Raises:
+      ValueError: the folder that `argument` or $JAXREG_DATA names does not exist.
+    """
+    for named, origin in (
+        (argument, "--data-root"),
+        (os.environ.get("JAXREG_DATA"), "$JAXREG_DATA"),
+    ):
+        if named:
+            if not Path(named).is_dir():
+                raise ValueError(f"{origin} names {named}, which is no folder: correct or drop it.")
+            return Path(named)
+    beside = None if config_path is None else Path(config_path).parent / "data"
+    return beside if beside is not None and beside.is_dir() else None
+
+
+def load_shapes(
+    config: DataConfig,
+    split: Split,
+    *,
+    root: str | Path | None = None,
+    points: int,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Clouds (n, P, 3) float32 and labels (n,) int32 of the source that `config.name` names.
+
+    `validation` is a share of the *training* shapes, chosen by `seed` and left out of `train`.
+    `points` is P where the source can choose (procedural shapes, resampled scans); ModelNet40 and
+    ICL-NUIM give the P of their files. `root` as of `data_root`; the procedural shapes need none.
+
+    Raises:
+      ValueError: an unknown name or split, missing data (the message gives the layout and where it
+        is published), malformed files, or a share that leaves no shape on one side.
+    """
+    if split not in ("train", "validation", "test"):
+        raise ValueError(f"split must be 'train', 'validation' or 'test', got {split!r}.")
+    if config.name == "shapes":
+        return _load_procedural(config, split, points, seed)
+    if root is None:
+        raise ValueError(
+            f"data.name = '{config.name}' is read from files, and no folder is known: give "
+            "--data-root, set $JAXREG_DATA, make data/ beside the configuration file, or use "
+            "data.name = 'shapes', which needs no file."
+        )
+    clouds, labels = _load_files(config, "test" if split == "test" else "train", root, points, seed)
+    if split == "test":
+        return clouds, labels
+    chosen = _held_out(len(clouds), config.validation_share, seed) == (split == "validation")
+    return clouds[chosen], labels[chosen]
+
+
+def _load_procedural(
+    config: DataConfig, split: Split, points: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every split has a stream of its own, so validation takes nothing away from training."""
+    counts = {
+        "train": config.train_shapes,
+        "validation": max(1, round(config.validation_share * config.train_shapes)),
+        "test": config.test_shapes,
+    }
+    return shapes.load(split, counts[split], points=points, seed=seed)
+
+
+def _load_files(
+    config: DataConfig, split: Literal["train", "test"], root: str | Path, points: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    if config.name == "modelnet40":
+        categories = config.train_categories if split == "train" else config.test_categories
+        return modelnet.load(root, split, categories=categories)
+    if config.name == "icl_nuim":
+        return icl_nuim.load(root, split)
+    if config.name == "seven_scenes":
+        stand_in = seven_scenes.TEST_SCENE not in seven_scenes.find_scenes(root)
+        if stand_in:
+            warnings.warn(seven_scenes.describe(root), stacklevel=3)
+        return seven_scenes.load(root, split, points=points, stand_in=stand_in, seed=seed)
+    raise ValueError(
+        "data.name must be 'modelnet40', 'shapes', 'seven_scenes' or 'icl_nuim', "
+        f"got {config.name!r}."
+    )
+
+
+def _held_out(count: int, share: float, seed: int) -> np.ndarray:
+    """Which of `count` training shapes are for validation: at least one, and not all."""
+    held = max(1, round(share * count))
+    if not 0 < share < 1 or held >= count:
+        raise ValueError(
+            f"validation_share = {share} of {count} training shapes leaves none on one side: "
+            "choose a share between 0 and 1, or more shapes."
+        )
+    mask = np.zeros(count, bool)
+    mask[np.random.default_rng(seed).permutation(count)[:held]] = True
+    return mask

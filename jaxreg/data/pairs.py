@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import Precision
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -36,20 +37,8 @@ def pair_sizes(config: PairConfig, shape_points: int) -> tuple[int, int]:
     Raises:
       ValueError: the shape has too few points for `points` or `kept`, or a size is not positive.
     """
-    available = _available(config, shape_points)
-    if config.crop == "none":
-        kept = available
-    elif 1 <= config.kept <= available:
-        kept = config.kept
-    else:
-        raise ValueError(
-            f"kept = {config.kept} points cannot remain of the {available} that "
-            f"sampling = '{config.sampling}' takes from a shape of {shape_points}: choose "
-            f"1 <= kept <= {available}, crop = 'none', or shapes with more points."
-        )
-    if config.outliers < 0:
-        raise ValueError(f"outliers = {config.outliers} is negative: choose 0 or more.")
-    return kept + config.outliers, kept + config.outliers
+    size = _kept(config, _available(config, shape_points)) + config.outliers
+    return size, size
 
 
 def make_pair(
@@ -79,13 +68,49 @@ def make_pair(
     keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
     mask = jnp.ones(shape.shape[0], bool) if shape_mask is None else shape_mask
     shape = PointCloud(without_padding(shape, shape_mask), mask)
-    transform = _draw_transform(keys.pose, config, shape.points.dtype)
-    source, still = _draw_clouds(keys.sampling, shape, config)
+    return _move_and_crop(keys, *_draw_clouds(keys.sampling, shape, config), config)
+
+
+def make_pair_from_scans(
+    key: PRNGKeyArray, source: PointCloud, reference: PointCloud, config: PairConfig
+) -> Pair:
+    """`make_pair` for two given clouds in one frame, such as two scans that are aligned already.
+
+    `points` and `sampling` are not used: all points go to the crop.
+
+    Raises:
+      ValueError: `kept` is larger than one of the clouds, or `outliers` is negative.
+    """
+    for cloud in (source, reference):
+        _kept(config, cloud.points.shape[0])
+    keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
+    clean = [PointCloud(without_padding(*cloud), cloud.mask) for cloud in (source, reference)]
+    return _move_and_crop(keys, *clean, config)
+
+
+def _move_and_crop(keys: _Keys, source: PointCloud, still: PointCloud, config: PairConfig) -> Pair:
+    """The pair of two clouds in one frame; `still` is the reference before its motion."""
+    transform = _draw_transform(keys.pose, config, source.points.dtype)
     reference = still._replace(points=rigid.apply(transform, still.points))
     scores = _crop_scores(keys.crop, source, still, reference, config)
     source = _finish(keys.source, source, scores[0], config)
     reference = _finish(keys.reference, reference, scores[1], config)
     return Pair(source, reference, transform)
+
+
+def _kept(config: PairConfig, available: int) -> int:
+    """Points of a cloud of `available` points after the crop."""
+    if config.outliers < 0:
+        raise ValueError(f"outliers = {config.outliers} is negative: choose 0 or more.")
+    if config.crop == "none":
+        return available
+    if not 1 <= config.kept <= available:
+        raise ValueError(
+            f"kept = {config.kept} points cannot remain of the {available} that each cloud has "
+            f"before the crop (sampling = '{config.sampling}'): choose 1 <= kept <= {available}, "
+            "crop = 'none', or shapes with more points."
+        )
+    return config.kept
 
 
 def _available(config: PairConfig, shape_points: int) -> int:
@@ -113,7 +138,7 @@ def _draw_transform(key: PRNGKeyArray, config: PairConfig, dtype) -> RigidTransf
 def _draw_rotation(key: PRNGKeyArray, config: PairConfig, dtype) -> Float[Array, "3 3"]:
     """`euler`: R = Rx Ry Rz of three angles U[0, max]; `axis-angle`; `full`: uniform on SO(3)."""
     angle_key, axis_key = jax.random.split(key)
-    largest = jnp.float32(jnp.deg2rad(config.rotation_max_deg))
+    largest = np.float32(np.deg2rad(config.rotation_max_deg))
     angles = jax.random.uniform(angle_key, (3,), jnp.float32, 0.0, largest).astype(dtype)
     normal = jax.random.normal(axis_key, (4,), jnp.float32).astype(dtype)
     if config.rotation == "full":
