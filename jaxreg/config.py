@@ -12,6 +12,7 @@ documentation of each field.
 
 import dataclasses
 import difflib
+import math
 import tomllib
 import typing
 from pathlib import Path
@@ -122,6 +123,8 @@ class DataConfig:
     """Procedural shapes to train on."""
     test_shapes: int = 256
     """Procedural shapes to test on."""
+    test_seed: int = 0
+    """Seed of the test pairs; not that of the training, so that all runs meet the same pairs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,8 +143,8 @@ class TrainConfig:
     """Steps of warm-up."""
     weight_decay: float = 1e-4
     """L2 term inside Adam (the predecessor's)."""
-    clip: float = 1.0
-    """Largest global norm of the gradient, in units of its running mean."""
+    clip: float = 1000.0
+    """Largest global norm of the gradient."""
     ema: float = 0.99
     """Decay of the running mean of the weights that is validated and released."""
     validate_every: int = 250
@@ -150,6 +153,18 @@ class TrainConfig:
     """Pairs of a validation."""
     seed: int = 0
     """The one seed; everything random derives from it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineConfig:
+    """Refinement of a pose by the ICP family."""
+
+    iterations: int = 30
+    """Iterations, each with fresh correspondences."""
+    max_distance: float = math.inf
+    """Pairs farther apart than this (unit of the clouds) do not count."""
+    trim: float = 1.0
+    """Share of the closest pairs that count."""
 
 
 @dataclasses.dataclass(frozen=True)

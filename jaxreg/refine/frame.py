@@ -1,0 +1,76 @@
+"""The frame that every refinement solves in: both clouds centred, lengths near 1.
+
+Solving at the original offset would lose the digits that the offset takes, and a damping or a step
+limit only means something when rotation and translation are of one size.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Bool, Float
+
+from jaxreg import rigid
+from jaxreg.neighbors import without_padding
+from jaxreg.numerics import safe_sqrt
+from jaxreg.types import RigidTransform
+
+
+class Frame(NamedTuple):
+    """Where the two clouds were taken from: ``x = centre + length x'``."""
+
+    source_centre: Float[Array, "3"]
+    reference_centre: Float[Array, "3"]
+    length: Float[Array, ""]
+
+
+def enter(
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    source_mask: Bool[Array, "n"] | None,
+    reference_mask: Bool[Array, "m"] | None,
+) -> tuple[Frame, Float[Array, "n 3"], Float[Array, "m 3"]]:
+    """Both clouds around their own centroids in units of their common root mean square radius.
+
+    Padded rows become zero. The unit is ``sqrt((s^2 + r^2) / 2)`` of the two radii, so that it does
+    not change when the clouds are swapped; it is 1 when every point coincides with the centroid.
+    """
+    source, source_centre = _centred(source, source_mask)
+    reference, reference_centre = _centred(reference, reference_mask)
+    variance = _mean_square(source, source_mask) + _mean_square(reference, reference_mask)
+    length = safe_sqrt(variance / 2)
+    length = jnp.where(length > 0, length, 1)
+    return Frame(source_centre, reference_centre, length), source / length, reference / length
+
+
+def transform_in(frame: Frame, transform: RigidTransform | None) -> RigidTransform:
+    """A transform of the original clouds (None: the identity) as one of the clouds in the frame."""
+    dtype = frame.length.dtype
+    if transform is None:
+        transform = rigid.identity(dtype)
+    rotation = jnp.asarray(transform.rotation, dtype)
+    rotated = jnp.matmul(rotation, frame.source_centre, precision=Precision.HIGHEST)
+    shift = jnp.asarray(transform.translation, dtype) + rotated - frame.reference_centre
+    return RigidTransform(rotation, shift / frame.length)
+
+
+def transform_out(frame: Frame, transform: RigidTransform) -> RigidTransform:
+    """The inverse of `transform_in`."""
+    rotated = jnp.matmul(transform.rotation, frame.source_centre, precision=Precision.HIGHEST)
+    shift = transform.translation * frame.length + frame.reference_centre
+    return RigidTransform(transform.rotation, shift - rotated)
+
+
+def _centred(points: Array, mask: Array | None) -> tuple[Array, Array]:
+    points = without_padding(points, mask)
+    centre = jnp.sum(points, axis=0) / _count(points, mask)
+    return without_padding(points - centre[None, :], mask), centre
+
+
+def _mean_square(points: Array, mask: Array | None) -> Array:
+    return jnp.sum(points * points) / _count(points, mask)
+
+
+def _count(points: Array, mask: Array | None) -> Array:
+    count = points.shape[0] if mask is None else jnp.sum(mask)
+    return jnp.maximum(jnp.asarray(count, points.dtype), 1)

@@ -1,0 +1,121 @@
+"""Which point of the source belongs to which point of the reference, and how much a pair counts."""
+
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg.neighbors import nearest_in
+
+Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"]
+
+_SMALLEST_SCALE = 1e-3
+"""Lower end of a kernel width that is taken from the residuals, in units of the frame: exact copies
+have no residual at all, and a width of zero would leave no weight for anything else."""
+
+
+class Pairs(NamedTuple):
+    """Pair `i` joins ``source[source_index[i]]`` to ``reference[reference_index[i]]``.
+
+    Pairs with `mask` False join anything and count for nothing.
+    """
+
+    source_index: Int[Array, "p"]
+    reference_index: Int[Array, "p"]
+    mask: Bool[Array, "p"]
+
+
+def closest_pairs(
+    moved: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    source_mask: Bool[Array, "n"] | None,
+    reference_mask: Bool[Array, "m"] | None,
+    *,
+    both_directions: bool,
+) -> Pairs:
+    """Every moved source point with its nearest reference point.
+
+    With `both_directions`, also every reference point with its nearest source point.
+    """
+    source_mask = _mask_of(moved, source_mask)
+    reference_mask = _mask_of(reference, reference_mask)
+    rows = jnp.arange(moved.shape[0], dtype=jnp.int32)
+    forward = Pairs(
+        rows, nearest_in(moved, reference, reference_mask), source_mask & jnp.any(reference_mask)
+    )
+    if not both_directions:
+        return forward
+    columns = jnp.arange(reference.shape[0], dtype=jnp.int32)
+    return Pairs(
+        jnp.concatenate([rows, nearest_in(reference, moved, source_mask)]),
+        jnp.concatenate([forward.reference_index, columns]),
+        jnp.concatenate([forward.mask, reference_mask & jnp.any(source_mask)]),
+    )
+
+
+def pair_weights(
+    squared: Float[Array, "p"],
+    mask: Bool[Array, "p"],
+    *,
+    max_distance: Float[Array, ""] | float,
+    trim: float,
+    kernel: Kernel,
+    scale: Float[Array, ""] | float | None,
+) -> Float[Array, "p"]:
+    """How much every pair counts, in [0, 1], from its squared residual.
+
+    0 where `mask` is False, beyond `max_distance`, or outside the share `trim` of smallest
+    residuals; else the weight of the `kernel` of width `scale`. `scale` None takes the width from
+    the residuals: 1.4826 times their median, the standard deviation of a normal distribution.
+    """
+    mask = mask & (squared <= max_distance**2)
+    if trim < 1:
+        mask = mask & (squared <= masked_quantile(squared, mask, trim))
+    if kernel == "none":
+        return mask.astype(squared.dtype)
+    if scale is None:
+        median = masked_quantile(squared, mask, 0.5)
+        variance = jnp.maximum(1.4826**2 * median, _SMALLEST_SCALE**2)
+    else:
+        variance = scale**2
+    return jnp.where(mask, kernel_weight(squared / variance, kernel), 0)
+
+
+def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
+    """``rho'(u) / u`` of a robust cost at ``u^2 = squared``, 1 at the origin.
+
+    Huber: ``min(1, 1/u)``. Cauchy: ``1 / (1 + u^2)``. Geman-McClure: ``1 / (1 + u^2)^2``.
+    Gaussian (Welsch): ``exp(-u^2 / 2)``.
+
+    Raises:
+      ValueError: `kernel` is none of these.
+    """
+    if kernel == "none":
+        return jnp.ones_like(squared)
+    if kernel == "huber":
+        return 1 / jnp.sqrt(jnp.maximum(squared, 1))
+    if kernel == "cauchy":
+        return 1 / (1 + squared)
+    if kernel == "geman_mcclure":
+        return 1 / (1 + squared) ** 2
+    if kernel == "gaussian":
+        return jnp.exp(-squared / 2)
+    raise ValueError(
+        f"kernel '{kernel}' does not exist: choose none, huber, cauchy, geman_mcclure or gaussian."
+    )
+
+
+def masked_quantile(
+    values: Float[Array, "p"], mask: Bool[Array, "p"], share: float
+) -> Float[Array, ""]:
+    """The smallest valid value that at least `share` of the valid ones do not exceed (none: 0)."""
+    count = jnp.sum(mask)
+    ordered = jnp.sort(jnp.where(mask, values, jnp.inf))
+    # The small subtraction keeps a rounded-up product (0.7 * 10 = 7.000001) from taking one more.
+    rank = jnp.ceil(share * count.astype(values.dtype) - 1e-3).astype(jnp.int32)
+    value = ordered[jnp.clip(rank - 1, 0, values.shape[0] - 1)]
+    return jnp.where(count > 0, value, 0)
+
+
+def _mask_of(points: Array, mask: Array | None) -> Array:
+    return jnp.ones(points.shape[0], bool) if mask is None else mask
