@@ -16,11 +16,13 @@ def read(path: Path, key: str) -> np.ndarray:
         raise ValueError(f"{path} is missing: download the data set again, or correct the list.")
     try:
         with h5py.File(path, "r") as file:
-            if key not in file:
+            item = file.get(key)
+            if not isinstance(item, h5py.Dataset):
                 raise ValueError(
-                    f"{path} has no key '{key}', only {sorted(file)}: is it from this data set?"
+                    f"{path} has no array '{key}' among its keys {sorted(file)}: is it a file of "
+                    "this data set?"
                 )
-            return np.asarray(file[key][()])
+            return np.asarray(item[()])
     except OSError as error:
         raise ValueError(
             f"{path} cannot be read as HDF5 ({error}): it is truncated or of another kind; "

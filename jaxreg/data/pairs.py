@@ -67,8 +67,9 @@ def make_pair(
     pair_sizes(config, shape.shape[0])
     keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
     mask = jnp.ones(shape.shape[0], bool) if shape_mask is None else shape_mask
-    shape = PointCloud(without_padding(shape, shape_mask), mask)
-    return _move_and_crop(keys, *_draw_clouds(keys.sampling, shape, config), config)
+    clean = PointCloud(without_padding(shape, shape_mask), mask)
+    source, still = _draw_clouds(keys.sampling, clean, config)
+    return _move_and_crop(keys, source, still, config)
 
 
 def make_pair_from_scans(
@@ -84,8 +85,9 @@ def make_pair_from_scans(
     for cloud in (source, reference):
         _kept(config, cloud.points.shape[0])
     keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
-    clean = [PointCloud(without_padding(*cloud), cloud.mask) for cloud in (source, reference)]
-    return _move_and_crop(keys, *clean, config)
+    source = source._replace(points=without_padding(*source))
+    reference = reference._replace(points=without_padding(*reference))
+    return _move_and_crop(keys, source, reference, config)
 
 
 def _move_and_crop(keys: _Keys, source: PointCloud, still: PointCloud, config: PairConfig) -> Pair:

@@ -73,7 +73,7 @@ def _normalised(surface: surfaces.Triangles) -> surfaces.Triangles:
 def _attached(rng: Generator, surface: surfaces.Triangles) -> surfaces.Triangles:
     """The surface with small boxes and pegs on it, half sunk in."""
     parts = [surface]
-    for place in surfaces.sample(rng, surface, rng.integers(1, _ATTACHMENTS + 1)):
+    for place in surfaces.sample(rng, surface, int(rng.integers(1, _ATTACHMENTS + 1))):
         size = rng.uniform(0.08, 0.3, 3)
         part = surfaces.box(size) if rng.random() < 0.5 else surfaces.cylinder(size[0] / 2, size[2])
         parts.append(surfaces.place(part, offset=place))

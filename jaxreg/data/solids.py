@@ -144,20 +144,20 @@ def composite(rng: Generator) -> Triangles:
             cylinder(size[0] / 2, size[2], top=size[1] / 2),
             superellipsoid(size / 2, rng.uniform(0.3, 1.5, 2), resolution=16),
         )[rng.integers(3)]
-        rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
+        rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         parts.append(place(part, offset=rng.uniform(-0.6, 0.6, 3), rotation=rotation))
     return union(*parts)
 
 
 def pipe(rng: Generator) -> Triangles:
     """A tube along a smooth random curve, with flanges at its ends."""
-    corners = rng.uniform(-1, 1, (4, 3)) + np.linspace(-1, 1, 4)[:, None] * (1, 0, 0)
+    corners = rng.uniform(-1, 1, (4, 3)) + np.linspace(-0.6, 0.6, 4)[:, None] * (1, 0, 0)
     s = np.linspace(0, 1, 40)[:, None]
     basis = [(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
-    curve = sum(weight * corner for weight, corner in zip(basis, 2 * corners, strict=True))
-    radius = np.full(40, rng.uniform(0.1, 0.22))
-    radius[:3] *= 2
-    radius[-3:] *= rng.uniform(1.2, 2.5)
+    curve = np.concatenate(basis, axis=1) @ (2 * corners)
+    radius = np.full(40, rng.uniform(0.15, 0.3))
+    radius[:3] *= rng.uniform(1.2, 2.0)
+    radius[-3:] *= rng.uniform(1.2, 2.0)
     return tube(curve, radius)
 
 
