@@ -165,6 +165,16 @@ class RefineConfig:
     """Pairs farther apart than this (unit of the clouds) do not count."""
     trim: float = 1.0
     """Share of the closest pairs that count."""
+    kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "cauchy"
+    """Robust weight of point-to-plane and generalised ICP; `icp` alone is plain unless told."""
+    anneal: float = 1.0
+    """How many times wider the kernel is in the first iteration than in the last."""
+    both_directions: bool = False
+    """Also pair every reference point with its nearest source point."""
+    neighbors: int = 10
+    """Neighbours of a point that its normal is computed from."""
+    thickness: float = 1e-3
+    """Variance across a surface, in units of the variance along it (generalised ICP)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,13 +10,10 @@ BATCH_AXIS = "batch"
 
 
 def relative_neighbors(
-    points: Float[Array, "n 3"], neighbors: Int[Array, "n k"], *, include_self: bool = False
-) -> Float[Array, "n kk 3"]:
-    """``points[neighbors[i, r]] - points[i]``; with `include_self` a zero edge stands in front."""
-    edges = points[neighbors] - points[:, None]
-    if include_self:
-        edges = jnp.concatenate([jnp.zeros_like(edges[:, :1]), edges], axis=1)
-    return edges
+    points: Float[Array, "n 3"], neighbors: Int[Array, "n k"]
+) -> Float[Array, "n k 3"]:
+    """``points[neighbors[i, r]] - points[i]``: unchanged when the cloud is translated."""
+    return points[neighbors] - points[:, None]
 
 
 class BatchNorm(nn.Module):

@@ -108,15 +108,23 @@ def matching_maps(
     reference_idx: Int[Array, "m k"],
     *,
     alpha: float,
+    nearest_idx: tuple[Int[Array, "n k"], Int[Array, "m k"]] | None = None,
     valid: Bool[Array, "m"] | None = None,
 ) -> Maps:
-    """The maps M, G, F (Eq. 3-5) from D and D-hat; None for D-hat is the single neighbourhood."""
-    scores = matching_scores(distance, valid)
-    fused, total = scores, distance
-    if nearest_distance is not None:
-        fused = scores + matching_scores(nearest_distance, valid)
-        total = distance + nearest_distance
-    dual = neighborhood_sum(fused, source_idx, reference_idx) / source_idx.shape[1]
+    """The maps M, G, F (Eq. 3-5) from D and D-hat; None for D-hat is the single neighbourhood.
+
+    `nearest_idx` holds the graphs of the 1-NN clouds where they differ from those of the input.
+    """
+    scores, total, k = matching_scores(distance, valid), distance, source_idx.shape[1]
+    if nearest_distance is None:
+        dual = neighborhood_sum(scores, source_idx, reference_idx) / k
+    else:
+        total, nearest = distance + nearest_distance, matching_scores(nearest_distance, valid)
+        if nearest_idx is None:  # The sum is linear: one graph, one sum.
+            dual = neighborhood_sum(scores + nearest, source_idx, reference_idx) / k
+        else:
+            dual = neighborhood_sum(scores, source_idx, reference_idx) / k
+            dual = dual + neighborhood_sum(nearest, *nearest_idx) / k
     return Maps(scores, dual, matching_scores(final_distance(total, dual, alpha=alpha), valid))
 
 

@@ -1,0 +1,120 @@
+"""Checkpoints of a run (Orbax), and released weights (plain arrays, no pickle)."""
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from jaxreg import config as configuration
+from jaxreg.config import Config
+
+_WEIGHTS = Path(__file__).parent / "weights"
+
+
+class Run:
+    """The working directory of one training run: `latest/`, `best/` and `metrics.jsonl`."""
+
+    def __init__(self, directory: Path, config: Config):
+        self.directory, self.config = directory, config
+        self._latest, self._best = (
+            ocp.CheckpointManager(
+                directory / name, options=ocp.CheckpointManagerOptions(max_to_keep=1)
+            )
+            for name in ("latest", "best")
+        )
+
+    def save(self, step: int, state: Any, error: float) -> None:
+        """Save as the newest state and, when `error` is the lowest so far, as the best."""
+        arguments = ocp.args.Composite(
+            state=ocp.args.StandardSave(state),
+            config=ocp.args.JsonSave(configuration.to_dict(self.config) | {"error": error}),
+        )
+        if error < self._best_error():
+            self._best.save(step, args=arguments)
+            self._best.wait_until_finished()
+        self._latest.save(step, args=arguments)
+
+    def restore(self, state: Any) -> Any:
+        """The newest state of the run, or `state` when there is none.
+
+        Raises:
+          ValueError: the run was made with another configuration.
+        """
+        if self._latest.latest_step() is None:
+            return state
+        saved = _saved_config(self._latest)[0]
+        if saved != self.config:
+            raise ValueError(
+                f"{self.directory} holds a run of another configuration "
+                f"({_difference(saved, self.config)}): choose another --workdir, or the same values."
+            )
+        restored = _restore(self._latest, state)
+        self._forget_after(self._latest.latest_step())
+        return restored
+
+    def log(self, entry: dict[str, float]) -> None:
+        """Append one object to `metrics.jsonl`."""
+        with (self.directory / "metrics.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+
+    def best(self, state: Any) -> Any:
+        """The averaged variables with the lowest validation error; `state` gives the structure."""
+        return _restore(self._best, state).average
+
+    def close(self) -> None:
+        """Wait for what is still being written."""
+        self._latest.close()
+        self._best.close()
+
+    def _best_error(self) -> float:
+        return np.inf if self._best.latest_step() is None else _saved_config(self._best)[1]
+
+    def _forget_after(self, step: int) -> None:
+        """Drop logged steps that will be run again."""
+        path = self.directory / "metrics.jsonl"
+        if path.exists():
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+            path.write_text(
+                "".join(line for line in lines if json.loads(line)["step"] <= step), encoding="utf-8"
+            )
+
+
+@contextlib.contextmanager
+def open_run(workdir: str | Path, config: Config) -> Iterator[Run]:
+    """The run in `workdir`, made when it does not exist; closed (and written out) at the end."""
+    directory = Path(workdir).resolve()
+    directory.mkdir(parents=True, exist_ok=True)
+    run = Run(directory, config)
+    try:
+        yield run
+    finally:
+        run.close()
+
+
+def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
+    saved = dict(
+        manager.restore(
+            manager.latest_step(), args=ocp.args.Composite(config=ocp.args.JsonRestore())
+        )["config"]
+    )
+    error = saved.pop("error")
+    return configuration.from_dict(saved, where=str(manager.directory)), error
+
+
+def _restore(manager: ocp.CheckpointManager, state: Any) -> Any:
+    abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
+    return manager.restore(
+        manager.latest_step(),
+        args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract)),
+    )["state"]
+
+
+def _difference(saved: Config, wanted: Config) -> str:
+    old, new = (flatten_dict(configuration.to_dict(c), sep=".") for c in (saved, wanted))
+    return ", ".join(f"{k}: {old[k]!r} there, {new[k]!r} here" for k in new if old[k] != new[k])

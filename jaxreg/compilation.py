@@ -1,0 +1,34 @@
+"""How this library compiles: the options that a CPU needs, and the cache on disk."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+# XLA:CPU fuses softmax -> products -> exp -> softmax into one kernel that runs several times slower
+# than its parts (measured on jaxlib 0.10; benchmarks/ compares both on the machine at hand).
+_CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
+
+
+def jit(function: Callable, **options) -> Callable:
+    """`jax.jit` with the compiler options that the default backend wants; `options` are jit's."""
+    if jax.default_backend() == "cpu":
+        options["compiler_options"] = _CPU_OPTIONS | options.get("compiler_options", {})
+    return jax.jit(function, **options)
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs in a directory of this user, for the next process.
+
+    Used by the command line tools only; a library must not change a program's configuration. A cache
+    that others could write to would run their code, so the directory is private (0700). Set
+    JAX_COMPILATION_CACHE_DIR to choose another.
+    """
+    if jax.config.jax_compilation_cache_dir:
+        return
+    root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    directory = root / "jaxreg" / "xla"
+    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

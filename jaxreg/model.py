@@ -1,0 +1,250 @@
+"""The network: one registration step, and its iteration (METHOD stages 1 to N_l).
+
+``variables = {"params": ..., "batch_stats": ...}`` is one plain dict, each with the keys `features`
+and `inliers`. Everything here is a pure function of one pair; a batch is the caller's `vmap`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxreg import rigid
+from jaxreg.config import Config, ModelConfig
+from jaxreg.features import DGCNN, relative_neighbors
+from jaxreg.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
+from jaxreg.invariants import geometric_structure
+from jaxreg.matching import Matches, feature_distance, match, matching_maps
+from jaxreg.neighbors import knn, without_padding
+from jaxreg.procrustes import weighted_procrustes
+from jaxreg.types import PointCloud, Registration, RigidTransform
+
+Variables = dict[str, Any]
+
+
+class Graph(NamedTuple):
+    """The neighbourhoods of one cloud; a rigid motion does not change them.
+
+    `neighbors` serves features and inliers, `matching` the neighbourhood sum, `nearest` is the 1-NN
+    index. `own` is the graph of the 1-NN cloud itself, where the configuration asks for it.
+    """
+
+    neighbors: Int[Array, "n k"]
+    matching: Int[Array, "n km"]
+    nearest: Int[Array, "n"]
+    own: "Graph | None" = None
+
+
+class Step(NamedTuple):
+    """One registration step, all that losses and pictures read.
+
+    `source` is the source before the step, `moved` after it, `transform` the motion between them.
+    `inliers` are the indices of the N_c most confident points.
+    """
+
+    source: Float[Array, "n 3"]
+    moved: Float[Array, "n 3"]
+    transform: RigidTransform
+    matches: Matches
+    confidence: Float[Array, "n"]
+    inliers: Int[Array, "n_c"]
+
+
+def neighborhood_graph(cloud: PointCloud, config: ModelConfig, *, own: bool | None = None) -> Graph:
+    """The graph of a cloud, computed once and kept over all iterations.
+
+    Raises:
+      ValueError: K is not smaller than the number of points.
+    """
+    nearest_first = knn(cloud.points, max(config.k, config.k_matching), cloud.mask)
+    neighbors = nearest_first[:, : config.k]
+    if config.include_self:
+        itself = jnp.arange(cloud.points.shape[0], dtype=neighbors.dtype)[:, None]
+        neighbors = jnp.concatenate([itself, neighbors], axis=1)
+    nearest, nested = nearest_first[:, 0], None
+    if config.one_nn == "own" if own is None else own:
+        nested = neighborhood_graph(
+            PointCloud(cloud.points[nearest], cloud.mask), config, own=False
+        )
+    return Graph(neighbors, nearest_first[:, : config.k_matching], nearest, nested)
+
+
+def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
+    """Fresh `params` and `batch_stats` of the network that `config` describes."""
+    features, inliers = _networks(config)
+    k = config.k + config.include_self
+    cloud, mask = jnp.ones((k + 1, 3)), jnp.ones(k + 1, bool)
+    neighbors = jnp.zeros((k + 1, k), jnp.int32)
+    structure = _structure(cloud, neighbors, config)
+    first = features.init(
+        jax.random.fold_in(key, 0), relative_neighbors(cloud, neighbors), mask, train=False
+    )
+    second = inliers.init(jax.random.fold_in(key, 1), structure, structure, mask, train=False)
+    return {
+        kind: {"features": first[kind], "inliers": second[kind]} for kind in ("params", "batch_stats")
+    }
+
+
+def _networks(config: ModelConfig):
+    inliers = InlierNetwork if config.inlier_network == "paper" else PredecessorInlierNetwork
+    return (
+        DGCNN(config.channels, config.width, config.bn_momentum),
+        inliers(config.inlier_width, config.bn_momentum),
+    )
+
+
+def _structure(points, neighbors, config: ModelConfig):
+    return geometric_structure(points, neighbors, edge=config.edge, angles=config.angles)
+
+
+def _run(module, name: str, variables: Variables, *inputs, train: bool):
+    """Apply a network; returns its output and `variables` with the statistics it updated."""
+    own = {kind: tree[name] for kind, tree in variables.items()}
+    if not train:
+        return module.apply(own, *inputs, train=False), variables
+    output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
+    statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
+    return output, variables | {"batch_stats": statistics}
+
+
+def point_features(
+    variables: Variables,
+    points: Float[Array, "n 3"],
+    graph: Graph,
+    mask: Bool[Array, "n"],
+    *,
+    config: ModelConfig,
+    train: bool = False,
+) -> tuple[Float[Array, "n c"], Variables]:
+    """F_P of Eq. 3 (DGCNN over `graph`) and the variables with updated statistics."""
+    network, _ = _networks(config)
+    edges = relative_neighbors(points, graph.neighbors)
+    return _run(network, "features", variables, edges, mask, train=train)
+
+
+def _both_features(variables, points, graph, mask, config, train):
+    """Features of a cloud and, where asked for, of its 1-NN cloud as a cloud of its own."""
+    features, variables = point_features(variables, points, graph, mask, config=config, train=train)
+    if graph.own is None:
+        return (features, None), variables
+    nearest, variables = point_features(
+        variables, points[graph.nearest], graph.own, mask, config=config, train=train
+    )
+    return (features, nearest), variables
+
+
+def _match(source_features, reference_features, source_graph, reference_graph, reference, config):
+    distance = feature_distance(source_features[0], reference_features[0])
+    nearest_distance, nearest_idx = None, None
+    if config.one_nn == "own":
+        nearest_distance = feature_distance(source_features[1], reference_features[1])
+        nearest_idx = (source_graph.own.matching, reference_graph.own.matching)
+    elif config.one_nn == "gather":
+        # The feature of the 1-NN point is that of the same point in the input cloud.
+        nearest_distance = distance[source_graph.nearest][:, reference_graph.nearest]
+    elif config.one_nn == "self":
+        nearest_distance = distance
+    maps = matching_maps(
+        distance,
+        nearest_distance,
+        source_graph.matching,
+        reference_graph.matching,
+        alpha=config.alpha,
+        nearest_idx=nearest_idx,
+        valid=reference.mask,
+    )
+    return match(maps, reference.points)
+
+
+def _solve(source, copy, confidence, inliers, mask, config: ModelConfig) -> RigidTransform:
+    weights = jnp.where(mask, confidence, 0)
+    if config.svd == "top":
+        source, copy, weights = source[inliers], copy[inliers], weights[inliers]
+    return weighted_procrustes(source, copy, weights)
+
+
+def iterate(
+    variables: Variables,
+    source: PointCloud,
+    reference: PointCloud,
+    *,
+    config: ModelConfig,
+    train: bool = False,
+    observe: Callable[[Step, Graph], Any] = lambda step, graph: None,
+) -> tuple[RigidTransform, Any, Variables]:
+    """N_l registration steps.
+
+    Returns the transform from source to reference (the composition of the steps), what `observe`
+    returned for each step and the source's graph, stacked, and the variables with updated statistics.
+    """
+    source = PointCloud(without_padding(*source), source.mask)
+    reference = PointCloud(without_padding(*reference), reference.mask)
+    usable = source.mask & jnp.any(reference.mask)
+    source_graph = neighborhood_graph(source, config)
+    reference_graph = neighborhood_graph(reference, config)
+    reference_features, variables = _both_features(
+        variables, reference.points, reference_graph, reference.mask, config, train
+    )
+    _, network = _networks(config)
+
+    def step(carry, _):
+        total, variables = carry
+        # From the original points every time, so that rounding does not add up over the steps.
+        points = rigid.apply(total, source.points)
+        features, variables = _both_features(
+            variables, points, source_graph, source.mask, config, train
+        )
+        matches = _match(
+            features, reference_features, source_graph, reference_graph, reference, config
+        )
+        structures = [
+            _structure(x, source_graph.neighbors, config) for x in (points, matches.copy)
+        ]
+        confidence, variables = _run(
+            network, "inliers", variables, *structures, source.mask, train=train
+        )
+        inliers = select_inliers(confidence, config.n_inliers, source.mask)
+        motion = _solve(points, matches.copy, confidence, inliers, usable, config)
+        moved = rigid.apply(motion, points)
+        seen = observe(Step(points, moved, motion, matches, confidence, inliers), source_graph)
+        return (rigid.compose(motion, total), variables), seen
+
+    start = (rigid.identity(source.points.dtype), variables)
+    (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
+    return transform, seen, variables
+
+
+def register_pair(
+    variables: Variables,
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    *,
+    config: Config,
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+) -> Registration:
+    """Register two clouds with a trained network; pure: jit, vmap and differentiate it.
+
+    Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
+    outside a mask are padding and reach nothing, not even as NaN. With no valid point in a cloud
+    `valid` is False and the transform the identity.
+
+    Raises:
+      ValueError: a cloud is not ``(n, 3)``; K is not smaller than a cloud; N_c exceeds the source.
+    """
+    clouds = [
+        PointCloud(points, jnp.ones(points.shape[0], bool) if mask is None else mask)
+        for points, mask in ((source, source_mask), (reference, reference_mask))
+    ]
+    transform, (confidence, copies), _ = iterate(
+        variables,
+        *clouds,
+        config=config.model,
+        observe=lambda step, graph: (step.confidence, step.matches.copy),
+    )
+    valid = jnp.any(clouds[0].mask) & jnp.any(clouds[1].mask)
+    confidence = jnp.where(clouds[0].mask, confidence[-1], 0)
+    matrix = rigid.to_matrix(transform)
+    return Registration(*transform, matrix, confidence, copies[-1], valid)

@@ -1,0 +1,172 @@
+"""Unsupervised training: the jitted step, validation, and the loop that can be stopped any time.
+
+A step depends on the state and the seed only: its pairs derive from ``fold_in(seed, step)``. A run
+that was interrupted and resumed is therefore bit-equal to one that was not.
+"""
+
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from jaxreg import checkpoint, report
+from jaxreg.compilation import jit
+from jaxreg.config import Config, TrainConfig
+from jaxreg.data import load_shapes
+from jaxreg.data.pairs import make_pair
+from jaxreg.evaluation import predict_all
+from jaxreg.features import BATCH_AXIS
+from jaxreg.losses import LossTerms, step_losses, total_loss
+from jaxreg.metrics import evaluate_transforms
+from jaxreg.model import Variables, init_variables, iterate
+from jaxreg.types import Pair
+
+_TRAIN, _VALIDATION = 1, 2  # Streams of random keys below the seed.
+
+
+class TrainState(NamedTuple):
+    """All that a step reads and writes. `average` is the running mean of `variables`."""
+
+    step: Int[Array, ""]
+    variables: Variables
+    average: Variables
+    optimizer: Any
+
+
+def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
+    """Adam with L2 inside, clipped, with linear warm-up and cosine decay."""
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, config.warmup, config.steps, config.final_learning_rate
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip),
+        optax.add_decayed_weights(config.weight_decay),
+        optax.adam(schedule),
+    )
+
+
+def create_train_state(config: Config) -> TrainState:
+    """The state before the first step."""
+    variables = init_variables(jax.random.key(config.train.seed), config.model)
+    optimizer = create_optimizer(config.train).init(variables["params"])
+    return TrainState(jnp.zeros((), jnp.int32), variables, variables, optimizer)
+
+
+def batch_loss(
+    params: Any, statistics: Any, pairs: Pair, *, config: Config
+) -> tuple[Float[Array, ""], tuple[LossTerms, Any]]:
+    """Mean loss of a batch of pairs, its terms, and the updated BatchNorm statistics.
+
+    Only the two clouds of each pair are read, never its transform.
+    """
+
+    def pair_loss(source, reference):
+        variables = {"params": params, "batch_stats": statistics}
+        _, terms, variables = iterate(
+            variables,
+            source,
+            reference,
+            config=config.model,
+            train=True,
+            observe=lambda step, graph: step_losses(
+                step, graph, source.mask, reference, config=config.loss, model=config.model
+            ),
+        )
+        terms = jax.tree.map(jnp.sum, terms)
+        return total_loss(terms, config.loss), terms, variables["batch_stats"]
+
+    loss, terms, statistics = jax.vmap(
+        pair_loss, axis_name=BATCH_AXIS, out_axes=(0, 0, None)
+    )(pairs.source, pairs.reference)
+    return jnp.mean(loss), (jax.tree.map(jnp.mean, terms), statistics)
+
+
+def draw_batch(step: Int[Array, ""], shapes: Float[Array, "s p 3"], config: Config) -> Pair:
+    """The pairs of a training step: random shapes, random poses and crops."""
+    stream = jax.random.fold_in(jax.random.key(config.train.seed), _TRAIN)
+    shape_key, pair_key = jax.random.split(jax.random.fold_in(stream, step))
+    chosen = jax.random.randint(shape_key, (config.train.batch,), 0, shapes.shape[0])
+    keys = jax.random.split(pair_key, config.train.batch)
+    return jax.vmap(lambda key, shape: make_pair(key, shape, config.pairs))(keys, shapes[chosen])
+
+
+def train_step(
+    state: TrainState, shapes: Float[Array, "s p 3"], *, config: Config
+) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+    """One optimiser step on fresh pairs, and what there is to log about it."""
+    pairs = draw_batch(state.step, shapes, config)
+    params, statistics = state.variables["params"], state.variables["batch_stats"]
+    (loss, (terms, statistics)), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
+        params, statistics, pairs, config=config
+    )
+    updates, optimizer = create_optimizer(config.train).update(gradient, state.optimizer, params)
+    variables = {"params": optax.apply_updates(params, updates), "batch_stats": statistics}
+    # A young average follows faster, so that it does not remember the initial weights for long.
+    decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
+    average = optax.incremental_update(variables, state.average, 1 - decay)
+    logged = {"loss": loss, "gradient_norm": optax.global_norm(gradient), **terms._asdict()}
+    return TrainState(state.step + 1, variables, average, optimizer), logged
+
+
+def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[str, float]:
+    """Errors on the first `validation_pairs` pairs of the held-out shapes; the same every time."""
+    key = jax.random.fold_in(jax.random.key(config.data.test_seed), _VALIDATION)
+    shapes = shapes[: config.train.validation_pairs]
+    predicted, truth = predict_all(variables, shapes, key, config=config, pairs=config.pairs)
+    metrics = evaluate_transforms(predicted, truth)
+    return {
+        name: float(metrics[name])
+        for name in ("mae_r_deg", "mie_r_deg", "mae_t", "median_rre_deg", "recall_1deg", "recall_5deg")
+    }
+
+
+def train(config: Config, workdir: str | Path, *, root: str | Path | None = None) -> Variables:
+    """Train, or go on training, in `workdir`; returns the best variables by validation error.
+
+    Writes `metrics.jsonl` (one object a line), the newest and the best checkpoint. The error that
+    chooses is the mean geodesic rotation error of the validation pairs, which are made from shapes
+    that are not trained on.
+
+    Raises:
+      ValueError: the data is missing, or `workdir` holds a run of another configuration.
+      FloatingPointError: the loss is not finite; says at which step. What was saved stays.
+    """
+    shapes, _ = load_shapes(
+        config.data, "train", root=root, points=_shape_points(config), seed=config.train.seed
+    )
+    held_out, _ = load_shapes(
+        config.data, "validation", root=root, points=_shape_points(config), seed=config.train.seed
+    )
+    step = jit(functools.partial(train_step, config=config), donate_argnums=0)
+    on_device = jnp.asarray(shapes)
+    with checkpoint.open_run(workdir, config) as run, report.training_progress(
+        config.train.steps
+    ) as progress:
+        state = run.restore(create_train_state(config))
+        while int(state.step) < config.train.steps:
+            state, logged = step(state, on_device)
+            number = int(state.step)
+            entry = {"step": number} | {name: float(value) for name, value in logged.items()}
+            if not np.isfinite([entry["loss"], entry["gradient_norm"]]).all():
+                raise FloatingPointError(
+                    f"the loss or its gradient is not finite at step {number}: {entry}. The last "
+                    f"checkpoint in {workdir} is from before; lower train.learning_rate or check "
+                    "the shapes."
+                )
+            last = number == config.train.steps
+            if number % config.train.validate_every == 0 or last:
+                entry |= {f"val_{k}": v for k, v in validate(state.average, held_out, config).items()}
+                run.save(number, state, entry["val_mie_r_deg"])
+            run.log(entry)
+            progress(entry)
+        return run.best(create_train_state(config))
+
+
+def _shape_points(config: Config) -> int:
+    factor = 2 if config.pairs.sampling == "disjoint" else 1
+    return factor * config.pairs.points
