@@ -30,7 +30,10 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 mpl.use("Agg")
-jaxtyping.install_import_hook("jaxreg", "beartype.beartype")
+# With the numeric tower an int is a float, as every type checker has it.
+jaxtyping.install_import_hook(
+    "jaxreg", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+)
 
 # The first example of a test compiles, so that no deadline and no example count near hypothesis'
 # own default suits JAX.

@@ -1,0 +1,135 @@
+"""What people see of results: tables, the progress of a training run, pictures."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from jaxreg.pictures import plot_curves, plot_pair
+
+__all__ = ["plot_curves", "plot_pair", "results_table", "training_progress"]
+
+Result = Mapping[str, float | str | None]
+"""What `evaluate.py` writes: the metrics of `jaxreg.metrics.summarize` and the method's name."""
+
+_COLUMNS = {
+    "pairs": ("pairs", "d"),
+    "mae_r_deg": ("MAE(R) deg", ".4f"),
+    "mie_r_deg": ("MIE(R) deg", ".4f"),
+    "mie_r_deg_float32_acos": ("as published", ".4f"),
+    "median_rre_deg": ("median deg", ".4f"),
+    "mae_t": ("MAE(t)", ".5f"),
+    "mie_t": ("MIE(t)", ".5f"),
+    "recall_1deg": ("recall 1 deg", ".3f"),
+    "recall_5deg": ("recall 5 deg", ".3f"),
+    "worst_rre_deg": ("worst deg", ".4f"),
+    "seconds_per_pair": ("s / pair", ".4f"),
+}
+_SECONDS_BETWEEN_LINES = 20.0
+
+
+def results_table(results: Sequence[Result], *, title: str | None = None) -> Table:
+    """A table of results: one stands on its side (a row a metric), several are a row each.
+
+    Metrics that no result has are left out. "As published" is MIE(R) by a float32 arccos, which
+    says nothing below 0.02 degrees.
+    """
+    present = [name for name in _COLUMNS if any(r.get(name) is not None for r in results)]
+    labels = [str(r.get("method", "")) for r in results]
+    cells = [[_cell(r, name) for name in present] for r in results]
+    table = Table(title=title, title_justify="left")
+    if len(results) == 1:
+        table.add_column("metric")
+        table.add_column(labels[0] or "value", justify="right")
+        for name, cell in zip(present, cells[0], strict=True):
+            table.add_row(_COLUMNS[name][0], cell)
+        return table
+    table.add_column("method")
+    for name in present:
+        table.add_column(_COLUMNS[name][0], justify="right")
+    for label, row in zip(labels, cells, strict=True):
+        table.add_row(label, *row)
+    return table
+
+
+def _cell(result: Result, name: str) -> str:
+    value = result.get(name)
+    return "-" if value is None else format(value, _COLUMNS[name][1])
+
+
+@contextlib.contextmanager
+def training_progress(
+    total: int, *, console: Console | None = None
+) -> Iterator[Callable[[Mapping[str, float]], None]]:
+    """Shows a run of `total` steps; call what it yields with the logged entry of every step.
+
+    An entry needs `step` and `loss`; `val_mie_r_deg`, where it stands, is shown as the validation
+    error until the next. On a terminal this is a bar with the time left, elsewhere a line now and
+    then and at every validation. A resumed run starts the bar, and the clock, at its first step.
+    """
+    console = console or Console()
+    show = _bar if console.is_terminal else _lines
+    with show(total, console) as update:
+        yield update
+
+
+@contextlib.contextmanager
+def _bar(total: int, console: Console) -> Iterator[Callable[[Mapping[str, float]], None]]:
+    columns = (
+        MofNCompleteColumn(),
+        BarColumn(bar_width=None),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    # The period is long enough that a validation between two steps does not upset the estimate.
+    with Progress(*columns, console=console, speed_estimate_period=120) as progress:
+        task = progress.add_task("compiling the training step", total=total)
+        status = _Status()
+        yield lambda entry: progress.update(
+            task, completed=int(entry["step"]), description=status.text(entry)
+        )
+
+
+@contextlib.contextmanager
+def _lines(total: int, console: Console) -> Iterator[Callable[[Mapping[str, float]], None]]:
+    status, begin = _Status(), None
+    last = float("-inf")
+
+    def update(entry: Mapping[str, float]) -> None:
+        nonlocal begin, last
+        now, step, text = time.monotonic(), int(entry["step"]), status.text(entry)
+        begin = begin or (now, step)
+        if now - last < _SECONDS_BETWEEN_LINES and "val_mie_r_deg" not in entry and step != total:
+            return
+        last = now
+        left = (total - step) * (now - begin[0]) / max(step - begin[1], 1)
+        timing = f"  about {left:.0f} s left" if step > begin[1] else ""
+        console.print(f"step {step}/{total}  {text}{timing}", highlight=False, soft_wrap=True)
+
+    yield update
+
+
+class _Status:
+    """The running mean of the loss and the last validation error, as text."""
+
+    def __init__(self) -> None:
+        self.loss, self.error = None, ""
+
+    def text(self, entry: Mapping[str, float]) -> str:
+        loss = entry["loss"]
+        self.loss = loss if self.loss is None else 0.95 * self.loss + 0.05 * loss
+        if "val_mie_r_deg" in entry:
+            self.error = f"  error {entry['val_mie_r_deg']:.3g} deg"
+        return f"loss {self.loss:.4g}{self.error}"

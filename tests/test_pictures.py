@@ -1,0 +1,99 @@
+"""Pictures are read back: the right colours stand in the right panels."""
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+from scipy.spatial.transform import Rotation
+
+from jaxreg import pictures
+from jaxreg.types import RigidTransform
+
+
+@pytest.fixture
+def pair(seed):
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(300, 3))
+    transform = RigidTransform(Rotation.random(rng=rng).as_matrix(), np.array([8.0, 0.0, 8.0]))
+    return source, source @ transform.rotation.T + transform.translation, transform
+
+
+def share(image, color) -> float:
+    """Share of the pixels within a shade of `color`, paler ones included."""
+    pale = np.linspace(0, 0.6, 20)[:, None]
+    shades = np.array(to_rgb(color)) * (1 - pale) + pale
+    distance = np.abs(image[..., None, :3] - shades).max(axis=-1).min(axis=-1)
+    return float(np.mean(distance < 0.02))
+
+
+def test_before_is_blue_and_yellow_after_is_green(pair, tmp_path):
+    source, reference, transform = pair
+    pictures.plot_pair(source, reference, transform, tmp_path / "pair.png", truth=transform)
+    image = imread(tmp_path / "pair.png")[100:-100]
+    before, after = np.array_split(image, 2, axis=1)
+    assert share(before, pictures.SOURCE) > 1e-4 > 1e-6 > share(after, pictures.SOURCE)
+    assert share(after, pictures.ALIGNED) > 1e-4 > 1e-6 > share(before, pictures.ALIGNED)
+    assert share(before, pictures.REFERENCE) > share(after, pictures.REFERENCE), "covered by green"
+    assert np.all(imread(tmp_path / "pair.png")[0, 0] == 1), "white background"
+
+
+def test_a_wrong_transform_leaves_the_reference_in_sight(pair, tmp_path):
+    source, reference, transform = pair
+    wrong = transform._replace(translation=np.zeros(3))
+    shares = []
+    for name, estimate in (("right", transform), ("wrong", wrong)):
+        pictures.plot_pair(source, reference, estimate, tmp_path / f"{name}.png", truth=transform)
+        image = imread(tmp_path / f"{name}.png")[100:-100]
+        shares.append(share(image[:, image.shape[1] // 2 :], pictures.REFERENCE))
+    assert shares[1] > 1.2 * shares[0]
+
+
+def test_confidence_adds_a_panel(pair, tmp_path):
+    source, reference, transform = pair
+    pictures.plot_pair(source, reference, transform, tmp_path / "2.png")
+    confidence = np.linspace(0, 1, len(source))
+    pictures.plot_pair(source, reference, transform, tmp_path / "3.png", confidence=confidence)
+    assert imread(tmp_path / "3.png").shape[1] * 2 == imread(tmp_path / "2.png").shape[1] * 3
+
+
+def test_title_states_the_errors_or_the_motion(pair):
+    _, _, transform = pair
+    turned = Rotation.from_euler("y", 2, degrees=True).as_matrix() @ transform.rotation
+    estimate = RigidTransform(turned, transform.translation + [0.0, 0.25, 0.0])
+    text = pictures._describe(estimate, transform)
+    assert text == "rotation error 2 deg, translation error 0.25"
+    assert "moved by 11.3" in pictures._describe(transform, None)
+
+
+@pytest.mark.parametrize("steps", [1, 5, 1001])
+def test_curves_of_any_run_can_be_drawn(tmp_path, steps):
+    with (tmp_path / "metrics.jsonl").open("w") as file:
+        for step in range(1, steps + 1):
+            entry = {"step": step, "loss": 1 / step, "gradient_norm": 1.0, "spatial_consistency": 2}
+            if step % 5 == 0:
+                entry["val_mie_r_deg"] = 1 / step
+            file.write(json.dumps(entry) + "\n")
+    pictures.plot_curves(tmp_path / "metrics.jsonl", tmp_path / "curves.png")
+    assert imread(tmp_path / "curves.png").shape == (600, 1650, 4)
+
+
+def test_read_metrics_gives_columns_with_gaps(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1, "loss": 3}\n{"step": 2, "loss": 2, "val": 0.5}\n')
+    columns = pictures.read_metrics(path)
+    np.testing.assert_array_equal(columns["loss"], [3, 2])
+    np.testing.assert_array_equal(columns["val"], [np.nan, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "no metrics at"), ("", "is empty"), ('{"step": 1}\nrubbish', "line 2 is no JSON")],
+)
+def test_read_metrics_names_what_is_wrong(tmp_path, content, message):
+    path = tmp_path / "metrics.jsonl"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        pictures.read_metrics(path)
