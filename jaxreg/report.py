@@ -17,7 +17,7 @@ from rich.table import Table
 
 from jaxreg.pictures import plot_curves, plot_pair
 
-__all__ = ["plot_curves", "plot_pair", "results_table", "training_progress"]
+__all__ = ["plot_curves", "plot_pair", "print_results", "results_table", "training_progress"]
 
 Result = Mapping[str, float | str | None]
 """What `evaluate.py` writes: the metrics of `jaxreg.metrics.summarize` and the method's name."""
@@ -60,6 +60,13 @@ def results_table(results: Sequence[Result], *, title: str | None = None) -> Tab
     for label, row in zip(labels, cells, strict=True):
         table.add_row(label, *row)
     return table
+
+
+def print_results(
+    results: Sequence[Result], *, title: str | None = None, console: Console | None = None
+) -> None:
+    """Print the table of `results`."""
+    (console or Console()).print(results_table(results, title=title))
 
 
 def _cell(result: Result, name: str) -> str:
@@ -133,3 +140,18 @@ class _Status:
         if "val_mie_r_deg" in entry:
             self.error = f"  error {entry['val_mie_r_deg']:.3g} deg"
         return f"loss {self.loss:.4g}{self.error}"
+
+
+@contextlib.contextmanager
+def counting_progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
+    """Shows how many of `total` pairs are done; call what it yields with each number of new ones."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("pairs, left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, transient=True) as progress:
+        task = progress.add_task(label, total=total)
+        yield lambda done: progress.advance(task, done)

@@ -16,14 +16,14 @@ RESULT = {
 }
 
 
-def text_of(renderable, width=120) -> str:
-    console = Console(file=io.StringIO(), width=width)
-    console.print(renderable)
+def text_of(results, title=None) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    report.print_results(results, title=title, console=console)
     return console.file.getvalue()
 
 
 def test_one_result_is_a_row_a_metric():
-    text = text_of(report.results_table([RESULT], title="unseen objects"))
+    text = text_of([RESULT], title="unseen objects")
     lines = [line for line in text.splitlines() if "MAE(R)" in line]
     assert len(lines) == 1
     assert "0.0012" in lines[0]
@@ -33,7 +33,7 @@ def test_one_result_is_a_row_a_metric():
 
 
 def test_several_results_are_a_row_each_and_gaps_are_shown():
-    text = text_of(report.results_table([RESULT, RESULT | {"method": "x", "seconds_per_pair": 2}]))
+    text = text_of([RESULT, RESULT | {"method": "x", "seconds_per_pair": 2}])
     rows = [line for line in text.splitlines() if "256" in line]
     assert len(rows) == 2
     assert "icp" in rows[0]
