@@ -1,0 +1,184 @@
+"""Clouds as people have them, made ready for the solver: checked, centred, scaled, reduced.
+
+Everything here is float64 on the host. Float32 at an offset of 1e6 m has a resolution of 6 cm, so
+offset and unit are taken off before any array reaches the device, and put back at the end.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+_LARGEST = 1e100
+"""Coordinates beyond would overflow when squared."""
+_FEWEST = 3
+"""Two points leave a rotation about the line between them."""
+
+
+class Scan(NamedTuple):
+    """A checked cloud in canonical order.
+
+    `points` are the distinct finite points in lexicographic order, so that neither the order nor the
+    repetition of the input's rows can change a result. `kept` says which input rows are finite.
+    """
+
+    points: Float[np.ndarray, "p 3"]
+    kept: Bool[np.ndarray, "n"]
+
+
+class Frame(NamedTuple):
+    """Where scaled coordinates come from: ``x = centre + length x'``."""
+
+    source_centre: Float[np.ndarray, "3"]
+    reference_centre: Float[np.ndarray, "3"]
+    length: float
+
+
+def check_points(
+    points: object, name: str, *, nonfinite: Literal["raise", "drop"] = "raise"
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    """`points` as float64 (n, 3), and which rows are finite.
+
+    Raises:
+      ValueError: not a numeric array of shape (n, 3), fewer than three (finite) points, a
+        coordinate beyond 1e100, or, unless `nonfinite` is "drop", one that is NaN or infinite.
+    """
+    if nonfinite not in ("raise", "drop"):
+        raise ValueError(f"nonfinite must be 'raise' or 'drop', got {nonfinite!r}.")
+    array = _as_floats(points, name)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(
+            f"{name} has shape {array.shape}, not (n, 3): give one point a row, x y z, "
+            "as in points[:, :3]."
+        )
+    finite = np.isfinite(array).all(axis=1)
+    if nonfinite == "raise" and not finite.all():
+        row = int(np.argmin(finite))
+        raise ValueError(
+            f"{name}: point {row} is {array[row].tolist()} and {np.sum(~finite)} of {len(array)} "
+            "points are not finite: remove them, or pass nonfinite='drop'."
+        )
+    if finite.sum() < _FEWEST:
+        raise ValueError(
+            f"{name} has {finite.sum()} finite points: a pose needs at least {_FEWEST}."
+        )
+    huge = finite & (np.abs(np.where(finite[:, None], array, 0)) > _LARGEST).any(axis=1)
+    if huge.any():
+        row = int(np.argmax(huge))
+        raise ValueError(
+            f"{name}: point {row} is {array[row].tolist()}, beyond {_LARGEST:g}: use a larger unit."
+        )
+    return array, finite
+
+
+def _as_floats(points: object, name: str) -> np.ndarray:
+    try:
+        array = np.asarray(points)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} is no array ({error}): give an array of shape (n, 3).") from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(
+            f"{name} has dtype {array.dtype}: give real numbers, as in "
+            "numpy.asarray(points, numpy.float64)."
+        )
+    return array.astype(np.float64)
+
+
+def make_scan(points: object, name: str, *, nonfinite: Literal["raise", "drop"] = "raise") -> Scan:
+    """The canonical form of a cloud; errors as `check_points`."""
+    array, finite = check_points(points, name, nonfinite=nonfinite)
+    return Scan(_distinct(array[finite]), finite)
+
+
+def _distinct(points: np.ndarray) -> np.ndarray:
+    """The distinct rows in lexicographic order (numpy.unique on rows is several times slower)."""
+    ordered = points[np.lexsort(points.T[::-1])] + 0.0  # -0.0 and 0.0 are one number.
+    new = np.ones(len(ordered), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    return ordered[new]
+
+
+def common_frame(source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"]) -> Frame:
+    """Centres and one common unit: the larger of the two clouds' root mean square radii.
+
+    The unit is 1 where all points of both clouds coincide.
+    """
+    centres = [_mean(points) for points in (source, reference)]
+    radii = [_radius(p - c) for p, c in zip((source, reference), centres, strict=True)]
+    length = max(radii)
+    # Below this the spread is the rounding of the offset, and no shape.
+    noise = 16 * np.finfo(np.float64).eps * max(np.abs(source).max(), np.abs(reference).max())
+    return Frame(*centres, length if length > noise else 1.0)
+
+
+def _mean(points: np.ndarray) -> np.ndarray:
+    """Mean of the rows, by way of one of them, so that a common offset costs no digits."""
+    return points[0] + (points - points[0]).mean(axis=0)
+
+
+def _radius(centred: np.ndarray) -> float:
+    largest = np.abs(centred).max()
+    if largest == 0:
+        return 0.0
+    return float(largest * np.sqrt(np.mean(np.sum((centred / largest) ** 2, axis=1))))
+
+
+def voxel_reduced(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "v 3"]:
+    """The mean of the points in every occupied cube of edge `size`, in lexicographic order."""
+    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    extent = cell.max(axis=0) + 1
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    _, index, count = np.unique(key, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, weights=axis) for axis in points.T], axis=1)
+    return sums / count[:, None]
+
+
+def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "v 3"]:
+    """At most `most` points that cover the cloud evenly; the cloud itself where it is small enough.
+
+    Voxel means with the smallest voxel that does it, to a few per cent.
+    """
+    if len(points) <= most:
+        return points
+    extent = float(np.ptp(points, axis=0).max())
+    low, high = 0.0, extent
+    reduced = points[:1]
+    size = extent / np.sqrt(most)
+    for _ in range(12):
+        candidate = voxel_reduced(points, size)
+        if len(candidate) > most:
+            low = size
+        else:
+            high, reduced = size, candidate
+            if len(candidate) > 0.92 * most:
+                break
+        # A surface has about 1 / size^2 occupied voxels.
+        guess = size * np.sqrt(len(candidate) / (0.96 * most))
+        size = guess if low < guess < high else (low + high) / 2
+    return reduced
+
+
+def padded(
+    points: Float[np.ndarray, "n 3"], size: int
+) -> tuple[Float[np.ndarray, "size 3"], Bool[np.ndarray, "size"]]:
+    """`points` as float32 filled up to `size` rows, and the mask of the valid ones."""
+    rows = np.zeros((size, 3), np.float32)
+    rows[: len(points)] = points
+    return rows, np.arange(size) < len(points)
+
+
+def bucket(count: int, *, smallest: int, largest: int) -> int:
+    """The smallest size ``smallest * 2^k`` that holds `count`; at most `largest`."""
+    size = smallest
+    while size < count:
+        size *= 2
+    return min(size, largest)
+
+
+def nearest(
+    tree: cKDTree, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Distance to, and index of, the nearest point of the tree, on all cores."""
+    distance, index = tree.query(points, workers=-1)
+    return np.asarray(distance), np.asarray(index)
