@@ -13,7 +13,7 @@ from jaxreg import rigid
 from jaxreg.config import LossConfig, ModelConfig
 from jaxreg.invariants import edges, included_angles
 from jaxreg.model import Graph, Step
-from jaxreg.neighbors import nearest_in
+from jaxreg.neighbors import nearest_in, without_padding
 from jaxreg.numerics import safe_norm
 from jaxreg.types import PointCloud, RigidTransform
 
@@ -32,8 +32,14 @@ def huber(x: Float[Array, "..."], beta: float) -> Float[Array, "..."]:
     return jnp.where(x < beta, x * x / 2, beta * x - beta * beta / 2)
 
 
-def global_consistency(moved: PointCloud, reference: PointCloud, *, beta: float) -> Float[Array, ""]:
+def global_consistency(
+    moved: PointCloud, reference: PointCloud, *, beta: float
+) -> Float[Array, ""]:
     """L_gc (Eq. 14): Huber of the squared distance to the nearest point, both ways, summed."""
+
+    # A NaN in a padded row would reach the derivative, through a product with a zero cotangent.
+    moved = PointCloud(without_padding(*moved), moved.mask)
+    reference = PointCloud(without_padding(*reference), reference.mask)
 
     def one_way(cloud: PointCloud, other: PointCloud):
         nearest = other.points[nearest_in(cloud.points, other.points, other.mask)]
@@ -95,12 +101,18 @@ def spatial_consistency(
 ) -> Float[Array, ""]:
     """L_sc (Eq. 17): mean of ``-log max_j G[i, j]`` over the inliers."""
     surprise = -jnp.log(jnp.maximum(peak[inliers], jnp.finfo(peak.dtype).tiny))
-    return jnp.sum(jnp.where(valid, surprise, 0)) / jnp.maximum(jnp.sum(valid), 1)
+    count = jnp.sum(valid, dtype=peak.dtype)
+    return jnp.sum(jnp.where(valid, surprise, 0)) / jnp.maximum(count, 1)
 
 
 def step_losses(
-    step: Step, graph: Graph, source_mask: Bool[Array, "n"], reference: PointCloud, *,
-    config: LossConfig, model: ModelConfig,
+    step: Step,
+    graph: Graph,
+    source_mask: Bool[Array, "n"],
+    reference: PointCloud,
+    *,
+    config: LossConfig,
+    model: ModelConfig,
 ) -> LossTerms:
     """The four terms of one step; a term whose weight is 0 is not computed."""
     valid, zero = source_mask[step.inliers], jnp.zeros((), step.source.dtype)

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """``sqrt(max(x, 0))`` whose derivative at ``x <= 0`` is 0 instead of infinite."""
-    positive = x > 0
+    """``sqrt(max(x, 0))`` whose derivative at ``x <= 0`` is 0 instead of infinite; NaN stays NaN."""
+    zero = x <= 0
     # The double `where`: the branch that is not taken must not see a zero either, since its
     # infinite derivative times the zero of the outer `where` would be NaN.
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, x)))
 
 
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
