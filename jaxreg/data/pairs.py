@@ -10,25 +10,39 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import Precision
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg import rigid
 from jaxreg.config import PairConfig
+from jaxreg.data import crops
 from jaxreg.neighbors import without_padding
 from jaxreg.types import Pair, PointCloud, RigidTransform
 
-_VIEWPOINT = 500.0  # Each coordinate of the far viewpoint, up to U[0, 1] and one common sign.
 _OUTLIER_STD, _OUTLIER_CLIP = 0.5, 1.0
+
+
+class _CloudKeys(NamedTuple):
+    crop: PRNGKeyArray
+    order: PRNGKeyArray
+    jitter: PRNGKeyArray
+    outlier_index: PRNGKeyArray
+    outlier_noise: PRNGKeyArray
 
 
 class _Keys(NamedTuple):
     sampling: PRNGKeyArray
-    pose: PRNGKeyArray
-    crop: PRNGKeyArray
-    source: PRNGKeyArray
-    reference: PRNGKeyArray
+    angles: PRNGKeyArray
+    axis: PRNGKeyArray
+    translation: PRNGKeyArray
+    source: _CloudKeys
+    reference: _CloudKeys
+
+
+def _split(key: PRNGKeyArray) -> _Keys:
+    """All keys by one split: every further one costs about 0.1 s of compilation."""
+    keys = jax.random.split(key, 14)
+    return _Keys(*keys[:4], source=_CloudKeys(*keys[4:9]), reference=_CloudKeys(*keys[9:]))
 
 
 def pair_sizes(config: PairConfig, shape_points: int) -> tuple[int, int]:
@@ -65,7 +79,7 @@ def make_pair(
     if shape.ndim != 2 or shape.shape[1] != 3:
         raise ValueError(f"shape must be (p, 3), got {shape.shape}: use jax.vmap for a batch.")
     pair_sizes(config, shape.shape[0])
-    keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
+    keys = _split(key)
     mask = jnp.ones(shape.shape[0], bool) if shape_mask is None else shape_mask
     clean = PointCloud(without_padding(shape, shape_mask), mask)
     source, still = _draw_clouds(keys.sampling, clean, config)
@@ -84,7 +98,7 @@ def make_pair_from_scans(
     """
     for cloud in (source, reference):
         _kept(config, cloud.points.shape[0])
-    keys = _Keys(*jax.random.split(key, len(_Keys._fields)))
+    keys = _split(key)
     source = source._replace(points=without_padding(*source))
     reference = reference._replace(points=without_padding(*reference))
     return _move_and_crop(keys, source, reference, config)
@@ -92,9 +106,9 @@ def make_pair_from_scans(
 
 def _move_and_crop(keys: _Keys, source: PointCloud, still: PointCloud, config: PairConfig) -> Pair:
     """The pair of two clouds in one frame; `still` is the reference before its motion."""
-    transform = _draw_transform(keys.pose, config, source.points.dtype)
+    transform = _draw_transform(keys, config, source.points.dtype)
     reference = still._replace(points=rigid.apply(transform, still.points))
-    scores = _crop_scores(keys.crop, source, still, reference, config)
+    scores = _crop_scores(keys, source, still, reference, config)
     source = _finish(keys.source, source, scores[0], config)
     reference = _finish(keys.reference, reference, scores[1], config)
     return Pair(source, reference, transform)
@@ -129,27 +143,25 @@ def _available(config: PairConfig, shape_points: int) -> int:
     return available
 
 
-def _draw_transform(key: PRNGKeyArray, config: PairConfig, dtype) -> RigidTransform:
+def _draw_transform(keys: _Keys, config: PairConfig, dtype) -> RigidTransform:
     """Angles and translation as drawn in float32, composed in `dtype`."""
-    rotation_key, translation_key = jax.random.split(key)
     half = config.translation_max
-    translation = jax.random.uniform(translation_key, (3,), jnp.float32, -half, half)
-    return RigidTransform(_draw_rotation(rotation_key, config, dtype), translation.astype(dtype))
+    translation = jax.random.uniform(keys.translation, (3,), jnp.float32, -half, half)
+    return RigidTransform(_draw_rotation(keys, config, dtype), translation.astype(dtype))
 
 
-def _draw_rotation(key: PRNGKeyArray, config: PairConfig, dtype) -> Float[Array, "3 3"]:
+def _draw_rotation(keys: _Keys, config: PairConfig, dtype) -> Float[Array, "3 3"]:
     """`euler`: R = Rx Ry Rz of three angles U[0, max]; `axis-angle`; `full`: uniform on SO(3)."""
-    angle_key, axis_key = jax.random.split(key)
     largest = np.float32(np.deg2rad(config.rotation_max_deg))
-    angles = jax.random.uniform(angle_key, (3,), jnp.float32, 0.0, largest).astype(dtype)
-    normal = jax.random.normal(axis_key, (4,), jnp.float32).astype(dtype)
+    angles = jax.random.uniform(keys.angles, (3,), jnp.float32, 0.0, largest).astype(dtype)
+    if config.rotation == "euler":
+        # Lower case is extrinsic: about z first, about x last.
+        return Rotation.from_euler("zyx", angles[::-1]).as_matrix().astype(dtype)
+    normal = jax.random.normal(keys.axis, (4,), jnp.float32).astype(dtype)
     if config.rotation == "full":
         rotation = Rotation.from_quat(normal / jnp.linalg.norm(normal))
-    elif config.rotation == "axis-angle":
-        rotation = Rotation.from_rotvec(angles[0] * normal[:3] / jnp.linalg.norm(normal[:3]))
     else:
-        # Lower case is extrinsic: about z first, about x last.
-        rotation = Rotation.from_euler("zyx", angles[::-1])
+        rotation = Rotation.from_rotvec(angles[0] * normal[:3] / jnp.linalg.norm(normal[:3]))
     return rotation.as_matrix().astype(dtype)
 
 
@@ -167,72 +179,42 @@ def _draw_clouds(
 
 
 def _crop_scores(
-    key: PRNGKeyArray,
+    keys: _Keys,
     source: PointCloud,
     still: PointCloud,
     reference: PointCloud,
     config: PairConfig,
-) -> tuple[Float[Array, "n"] | None, Float[Array, "n"] | None]:
+) -> tuple[Float[Array, "n"] | None, Float[Array, "m"] | None]:
     """Which points a crop keeps: those of the largest score. `still` is the unmoved reference."""
     if config.crop == "none":
         return None, None
-    first, second = jax.random.split(key)
-    second = second if config.independent_crops else first
+    draw = crops.viewpoint if config.crop == "viewpoint" else crops.direction
+    first = draw(keys.source.crop)
+    second = draw(keys.reference.crop) if config.independent_crops else first
     if config.crop == "viewpoint":
-        return _nearness(source, _draw_viewpoint(first)), _nearness(
-            reference, _draw_viewpoint(second)
-        )
-    return _along(source, _draw_direction(first)), _along(still, _draw_direction(second))
-
-
-def _draw_viewpoint(key: PRNGKeyArray) -> Float[Array, "3"]:
-    """``+-(500, 500, 500) + U[0, 1]^3``, one sign for all three axes."""
-    sign_key, offset_key = jax.random.split(key)
-    sign = jax.random.rademacher(sign_key, (), jnp.float32)
-    return sign * _VIEWPOINT + jax.random.uniform(offset_key, (3,), jnp.float32)
-
-
-def _nearness(cloud: PointCloud, viewpoint: Float[Array, "3"]) -> Float[Array, "n"]:
-    """Order by distance to the viewpoint: ``(2 p.v - |p|^2) / 2|v|``, the nearest largest.
-
-    Expanded and without the constant |v|^2, beside which float32 would round p away.
-    """
-    viewpoint = viewpoint.astype(cloud.points.dtype)
-    far = jnp.linalg.norm(viewpoint)
-    along = jnp.matmul(cloud.points, viewpoint / far, precision=Precision.HIGHEST)
-    return along - jnp.sum(cloud.points**2, axis=1) / (2 * far)
-
-
-def _draw_direction(key: PRNGKeyArray) -> Float[Array, "3"]:
-    return jax.random.normal(key, (3,), jnp.float32)
-
-
-def _along(cloud: PointCloud, direction: Float[Array, "3"]) -> Float[Array, "n"]:
-    direction = direction.astype(cloud.points.dtype)
-    return jnp.matmul(cloud.points, direction, precision=Precision.HIGHEST)
+        return crops.nearness(source.points, first), crops.nearness(reference.points, second)
+    return crops.along(source.points, first), crops.along(still.points, second)
 
 
 def _finish(
-    key: PRNGKeyArray, cloud: PointCloud, score: Float[Array, "n"] | None, config: PairConfig
+    keys: _CloudKeys, cloud: PointCloud, score: Float[Array, "n"] | None, config: PairConfig
 ) -> PointCloud:
     """Crop by score, shuffle, jitter, append outliers."""
-    order_key, jitter_key, outlier_key = jax.random.split(key, 3)
     if score is not None:
         score = jnp.where(cloud.mask, score, -jnp.inf)
         cloud = _take(cloud, jax.lax.top_k(score, config.kept)[1])
-    cloud = _take(cloud, _shuffled(order_key, cloud.mask))
+    cloud = _take(cloud, _shuffled(keys.order, cloud.mask))
     if config.jitter > 0:
-        noise = _noise(jitter_key, cloud.points, config.jitter, config.jitter_clip)
+        noise = _noise(keys.jitter, cloud.points, config.jitter, config.jitter_clip)
         cloud = cloud._replace(points=cloud.points + noise)
-    return _append_outliers(outlier_key, cloud, config.outliers) if config.outliers else cloud
+    return _append_outliers(keys, cloud, config.outliers) if config.outliers else cloud
 
 
-def _append_outliers(key: PRNGKeyArray, cloud: PointCloud, count: int) -> PointCloud:
+def _append_outliers(keys: _CloudKeys, cloud: PointCloud, count: int) -> PointCloud:
     """`count` further points: random valid points of the cloud + N(0, 0.5), clipped to +-1."""
-    index_key, noise_key = jax.random.split(key)
     valid = jnp.maximum(jnp.sum(cloud.mask, dtype=jnp.int32), 1)
-    added = _take(cloud, jax.random.randint(index_key, (count,), 0, valid, jnp.int32))
-    points = added.points + _noise(noise_key, added.points, _OUTLIER_STD, _OUTLIER_CLIP)
+    added = _take(cloud, jax.random.randint(keys.outlier_index, (count,), 0, valid, jnp.int32))
+    points = added.points + _noise(keys.outlier_noise, added.points, _OUTLIER_STD, _OUTLIER_CLIP)
     return PointCloud(
         jnp.concatenate([cloud.points, points]), jnp.concatenate([cloud.mask, added.mask])
     )

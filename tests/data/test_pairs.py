@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg.config import PairConfig
-from jaxreg.data import modelnet, pairs, shapes
+from jaxreg.data import modelnet, shapes
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
 from jaxreg.types import PointCloud
 
@@ -160,16 +160,6 @@ def separation(distance, rows):
     kept = np.zeros(len(distance), bool)
     kept[rows] = True
     return distance[kept].max() - distance[~kept].min()
-
-
-@pytest.mark.parametrize("offset", [0.0, 4.0])
-def test_order_by_distance_is_right_in_float32(offset, seed):
-    cloud = random_cloud(seed, 2000, np.float32) + np.float32(offset)
-    viewpoint = -500 + np.random.default_rng(seed).random(3, np.float32)
-    score = pairs._nearness(PointCloud(cloud, jnp.ones(2000, bool)), jnp.asarray(viewpoint))
-    exact = np.linalg.norm(np.asarray(cloud, np.float64) - viewpoint.astype(np.float64), axis=1)
-    ordered = exact[np.argsort(-np.asarray(score))]
-    assert np.maximum.accumulate(ordered) - ordered == pytest.approx(0, abs=2e-6)
 
 
 def one_direction_separates(clouds):
