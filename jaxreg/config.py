@@ -159,15 +159,17 @@ class TrainConfig:
 class RefineConfig:
     """Refinement of a pose by the ICP family."""
 
+    method: Literal["icp", "point_to_plane", "gicp"] = "gicp"
+    """Point to point, point to plane, or generalised (plane to plane)."""
     iterations: int = 30
     """Iterations, each with fresh correspondences."""
     max_distance: float = math.inf
     """Pairs farther apart than this (unit of the clouds) do not count."""
     trim: float = 1.0
     """Share of the closest pairs that count."""
-    kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "cauchy"
+    kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "geman_mcclure"
     """Robust weight of point-to-plane and generalised ICP; `icp` alone is plain unless told."""
-    anneal: float = 1.0
+    anneal: float = 10.0
     """How many times wider the kernel is in the first iteration than in the last."""
     both_directions: bool = False
     """Also pair every reference point with its nearest source point."""
@@ -175,6 +177,13 @@ class RefineConfig:
     """Neighbours of a point that its normal is computed from."""
     thickness: float = 1e-3
     """Variance across a surface, in units of the variance along it (generalised ICP)."""
+    weak_threshold: float = 0.01
+    """A motion is weak when it changes the distances to the surfaces by a smaller mean square than
+    this, for a motion of one (1/3 for surfaces that face all ways)."""
+    dense_limit: int = 1024
+    """Largest cloud, in points, whose pairs are found by brute force; above, by a tree on the host."""
+    tolerance: float = 1e-5
+    """The host stops when a step turns by less (radians) and moves by less (in radii of the cloud)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,16 +213,22 @@ def load_config(path: str | Path) -> Config:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ValueError(f"no configuration file at {path}: see configs/ for the ones given.") from None
-    except tomllib.TOMLDecodeError as error:
+        raise ValueError(
+            f"no configuration file at {path}: see configs/ for the ones given."
+        ) from None
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not valid TOML: {error}.") from None
     return from_dict(content, where=str(path))
 
 
 def from_dict(content: dict[str, Any], *, where: str = "configuration") -> Config:
     """The configuration of a nested dict of deviations; errors as `load_config`."""
-    merged = dict(content.get("pairs", {})) | dict(content.get("test_pairs", {}))
-    return _build(Config, content | {"test_pairs": merged}, where)
+    pairs, test_pairs = content.get("pairs", {}), content.get("test_pairs", {})
+    if isinstance(pairs, dict) and isinstance(test_pairs, dict):
+        content = content | {"test_pairs": pairs | test_pairs}
+    return _build(Config, content, where)
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -240,10 +255,14 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if typing.get_origin(hint) is Literal:
         choices = typing.get_args(hint)
         if value not in choices:
-            raise ValueError(f"{where} must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+            raise ValueError(
+                f"{where} must be one of {', '.join(map(repr, choices))}, got {value!r}."
+            )
         return value
     if typing.get_origin(hint) is tuple:
-        return tuple(value)
+        if not isinstance(value, (list, tuple)):
+            raise ValueError(f"{where} must be a list, got {value!r}.")
+        return tuple(_convert(typing.get_args(hint)[0], item, where) for item in value)
     if hint is float and type(value) is int:
         return float(value)
     if type(value) is not hint:

@@ -34,7 +34,11 @@ def enter(
 
     Padded rows become zero. The unit is ``sqrt((s^2 + r^2) / 2)`` of the two radii, so that it does
     not change when the clouds are swapped; it is 1 when every point coincides with the centroid.
+
+    Raises:
+      ValueError: a cloud is not ``(n, 3)`` or has no row.
     """
+    check_clouds(source, reference)
     source, source_centre = _centred(source, source_mask)
     reference, reference_centre = _centred(reference, reference_mask)
     variance = _mean_square(source, source_mask) + _mean_square(reference, reference_mask)
@@ -59,6 +63,16 @@ def transform_out(frame: Frame, transform: RigidTransform) -> RigidTransform:
     rotated = jnp.matmul(transform.rotation, frame.source_centre, precision=Precision.HIGHEST)
     shift = transform.translation * frame.length + frame.reference_centre
     return RigidTransform(transform.rotation, shift - rotated)
+
+
+def check_clouds(source: Array, reference: Array) -> None:
+    """Raises ValueError unless both clouds are ``(n, 3)`` with at least one row."""
+    for name, points in (("source", source), ("reference", reference)):
+        if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
+            raise ValueError(
+                f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, "
+                "and use jax.vmap for a batch."
+            )
 
 
 def _centred(points: Array, mask: Array | None) -> tuple[Array, Array]:

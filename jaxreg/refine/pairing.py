@@ -25,6 +25,20 @@ class Pairs(NamedTuple):
     mask: Bool[Array, "p"]
 
 
+class Weighting(NamedTuple):
+    """How the pairs of an iteration are weighted; see `pair_weights`."""
+
+    kernel: Kernel
+    scale: Float[Array, ""] | float | None
+    max_distance: Float[Array, ""] | float
+    trim: float
+
+    def in_units_of(self, length: Float[Array, ""] | float) -> "Weighting":
+        """The same weighting for clouds divided by `length`."""
+        scale = None if self.scale is None else self.scale / length
+        return self._replace(scale=scale, max_distance=self.max_distance / length)
+
+
 def closest_pairs(
     moved: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],
@@ -54,31 +68,32 @@ def closest_pairs(
 
 
 def pair_weights(
-    squared: Float[Array, "p"],
+    squared_distance: Float[Array, "p"],
+    squared_residual: Float[Array, "p"],
     mask: Bool[Array, "p"],
-    *,
-    max_distance: Float[Array, ""] | float,
-    trim: float,
-    kernel: Kernel,
-    scale: Float[Array, ""] | float | None,
+    weighting: Weighting,
+    widening: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, "p"]:
-    """How much every pair counts, in [0, 1], from its squared residual.
+    """How much every pair counts, in [0, 1].
 
-    0 where `mask` is False, beyond `max_distance`, or outside the share `trim` of smallest
-    residuals; else the weight of the `kernel` of width `scale`. `scale` None takes the width from
-    the residuals: 1.4826 times their median, the standard deviation of a normal distribution.
+    0 where `mask` is False, where the points are farther apart than `max_distance`, or outside the
+    share `trim` of closest pairs; else the weight of the `kernel` at the residual over its width.
+    The width is `widening` times `scale`; `scale` None takes it from the residuals, 1.4826 times
+    their median, which is the standard deviation of normal ones.
     """
-    mask = mask & (squared <= max_distance**2)
-    if trim < 1:
-        mask = mask & (squared <= masked_quantile(squared, mask, trim))
-    if kernel == "none":
-        return mask.astype(squared.dtype)
-    if scale is None:
-        median = masked_quantile(squared, mask, 0.5)
+    mask = mask & (squared_distance <= weighting.max_distance**2)
+    if weighting.trim < 1:
+        limit = masked_quantile(squared_distance, mask, weighting.trim)
+        mask = mask & (squared_distance <= limit)
+    if weighting.kernel == "none":
+        return mask.astype(squared_residual.dtype)
+    if weighting.scale is None:
+        median = masked_quantile(squared_residual, mask, 0.5)
         variance = jnp.maximum(1.4826**2 * median, _SMALLEST_SCALE**2)
     else:
-        variance = scale**2
-    return jnp.where(mask, kernel_weight(squared / variance, kernel), 0)
+        variance = weighting.scale**2
+    relative = squared_residual / (variance * widening**2)
+    return jnp.where(mask, kernel_weight(relative, weighting.kernel), 0)
 
 
 def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
@@ -105,6 +120,11 @@ def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
     )
 
 
+def widenings(iterations: int, anneal: float, dtype: jnp.dtype) -> Float[Array, "iterations"]:
+    """How much wider than its final width the kernel is: from `anneal` to 1 by equal factors."""
+    return jnp.asarray(anneal, dtype) ** jnp.linspace(1, 0, iterations, dtype=dtype)
+
+
 def masked_quantile(
     values: Float[Array, "p"], mask: Bool[Array, "p"], share: float
 ) -> Float[Array, ""]:
@@ -115,6 +135,16 @@ def masked_quantile(
     rank = jnp.ceil(share * count.astype(values.dtype) - 1e-3).astype(jnp.int32)
     value = ordered[jnp.clip(rank - 1, 0, values.shape[0] - 1)]
     return jnp.where(count > 0, value, 0)
+
+
+def check_options(*, iterations: int, trim: float, anneal: float) -> None:
+    """Raises ValueError unless ``iterations >= 1``, ``0 < trim <= 1`` and ``anneal >= 1``."""
+    if iterations < 1:
+        raise ValueError(f"iterations = {iterations}: choose at least 1.")
+    if not 0 < trim <= 1:
+        raise ValueError(f"trim = {trim} is no share of the pairs: choose 0 < trim <= 1.")
+    if not anneal >= 1:
+        raise ValueError(f"anneal = {anneal} would narrow the first kernel: choose 1 or more.")
 
 
 def _mask_of(points: Array, mask: Array | None) -> Array:

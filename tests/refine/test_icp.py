@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
-from jaxreg.refine.icp import check_clouds, icp
+from jaxreg.refine.frame import check_clouds
+from jaxreg.refine.icp import icp
 from jaxreg.types import RigidTransform
 
 

@@ -1,0 +1,113 @@
+"""One Gauss-Newton step on a rigid pose: linearise, solve a damped 6x6 system, update.
+
+The cost is ``sum_i r_i^T M_i r_i`` with ``r_i = R x_i + t - y_i``. The metric ``M_i`` says what
+kind of ICP it is: ``w I`` point to point, ``w n n^T`` point to plane, ``w (C_y + R C_x R^T)^-1``
+generalised.
+"""
+
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Float
+
+from jaxreg.numerics import safe_norm
+from jaxreg.types import RigidTransform
+
+_DAMPING = 1e-5
+"""Added to the diagonal, in units of its mean. Ten times the rounding error of the sums in float32:
+it keeps a motion that the pairs do not see (along a plane, about a sphere) finite and near zero."""
+_LARGEST_ROTATION = 0.5
+"""Radians of one step. A linearisation says nothing beyond."""
+_LARGEST_TRANSLATION = 1.0
+"""Length of one step, in units of the frame."""
+
+
+def gauss_newton_step(
+    pose: RigidTransform,
+    moved: Float[Array, "p 3"],
+    target: Float[Array, "p 3"],
+    metric: Float[Array, "p 3 3"],
+) -> RigidTransform:
+    """The pose after one damped step on pairs `moved` (already under `pose`) and `target`."""
+    information, gradient = normal_equations(moved, target, metric)
+    rotation, translation = jnp.split(-solve_damped(information, gradient), 2)
+    rotation = _shortened(rotation, _LARGEST_ROTATION)
+    return update_left(pose, rotation, _shortened(translation, _LARGEST_TRANSLATION))
+
+
+def normal_equations(
+    moved: Float[Array, "p 3"], target: Float[Array, "p 3"], metric: Float[Array, "p 3 3"]
+) -> tuple[Float[Array, "6 6"], Float[Array, "6"]]:
+    """``H = sum_i J_i^T M_i J_i`` and ``g = sum_i J_i^T M_i r_i``, rotation before translation.
+
+    ``J_i = [-[p_i]_x, I]`` is the derivative of the moved point ``p_i`` by a rotation vector and a
+    translation applied from the left, ``exp(omega) p + v``. The metrics carry the weights.
+    """
+    p = moved
+    zero, one = jnp.zeros_like(p[:, 0]), jnp.ones_like(p[:, 0])
+    jacobian = jnp.stack(
+        [
+            jnp.stack([zero, p[:, 2], -p[:, 1], one, zero, zero], axis=-1),
+            jnp.stack([-p[:, 2], zero, p[:, 0], zero, one, zero], axis=-1),
+            jnp.stack([p[:, 1], -p[:, 0], zero, zero, zero, one], axis=-1),
+        ],
+        axis=1,
+    )
+    weighted = jnp.matmul(metric, jacobian, precision=Precision.HIGHEST)
+    weighted = weighted.reshape(-1, 6).T
+    information = jnp.matmul(weighted, jacobian.reshape(-1, 6), precision=Precision.HIGHEST)
+    residual = (moved - target).reshape(-1)
+    return information, jnp.matmul(weighted, residual, precision=Precision.HIGHEST)
+
+
+def solve_damped(
+    information: Float[Array, "6 6"], gradient: Float[Array, "6"]
+) -> Float[Array, "6"]:
+    """``(H + d I)^-1 g`` with ``d`` in proportion to the mean of H's diagonal; 0 where H is 0."""
+    mean = jnp.trace(information) / 6
+    scale = jnp.where(mean > 0, mean, 1)
+    damped = information / scale + _DAMPING * jnp.eye(6, dtype=information.dtype)
+    return jnp.linalg.solve(damped, gradient / scale)
+
+
+def update_left(
+    pose: RigidTransform, rotation: Float[Array, "3"], translation: Float[Array, "3"]
+) -> RigidTransform:
+    """``(exp(omega) R, exp(omega) t + v)``, with R kept orthogonal to rounding."""
+    turn = rotation_from_vector(rotation)
+    product = jnp.matmul(turn, pose.rotation, precision=Precision.HIGHEST)
+    # A Newton step towards the nearest orthogonal matrix, or a chain of products drifts away.
+    gram = jnp.matmul(product.T, product, precision=Precision.HIGHEST)
+    correction = 1.5 * jnp.eye(3, dtype=gram.dtype) - 0.5 * gram
+    shift = jnp.matmul(turn, pose.translation, precision=Precision.HIGHEST) + translation
+    return RigidTransform(jnp.matmul(product, correction, precision=Precision.HIGHEST), shift)
+
+
+def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """``exp([omega]_x)`` by Rodrigues' formula, smooth at zero (radians)."""
+    squared = jnp.sum(vector * vector)
+    small = squared < 1e-4
+    safe = jnp.where(small, 1, squared)
+    angle = jnp.sqrt(safe)
+    # Series where the quotients lose their digits; the next terms are below 1e-16 there.
+    sine = jnp.where(
+        small, 1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42)), jnp.sin(angle) / angle
+    )
+    cosine = jnp.where(
+        small,
+        0.5 - squared / 24 * (1 - squared / 30 * (1 - squared / 56)),
+        (1 - jnp.cos(angle)) / safe,
+    )
+    cross = skew(vector)
+    squared_cross = jnp.matmul(cross, cross, precision=Precision.HIGHEST)
+    return jnp.eye(3, dtype=vector.dtype) + sine * cross + cosine * squared_cross
+
+
+def skew(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """``[v]_x``, the matrix of ``x -> v x x`` (cross product)."""
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+
+
+def _shortened(vector: Float[Array, "3"], largest: float) -> Float[Array, "3"]:
+    return vector * (largest / jnp.maximum(safe_norm(vector), largest))

@@ -1,0 +1,176 @@
+"""How well surfaces determine a pose: its 6x6 covariance, and the motions that they leave free.
+
+Both come from the distances to the planes of the reference, whatever method found the pose: points
+that slide along a surface are the same surface to any scanner.
+"""
+
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxreg import rigid
+from jaxreg.config import RefineConfig
+from jaxreg.neighbors import knn
+from jaxreg.refine import frame
+from jaxreg.refine.gauss_newton import normal_equations
+from jaxreg.refine.normals import normals
+from jaxreg.refine.pairing import Kernel, Pairs, Weighting, closest_pairs
+from jaxreg.refine.point_to_plane import plane_metric
+from jaxreg.types import RigidTransform
+
+_DEFAULT = RefineConfig()
+_SMALLEST_EIGENVALUE = 1e-6
+"""Of the information matrix, relative to its largest: what is below counts as this much, so that a
+free motion has a huge variance instead of an infinite one."""
+_PITCH = 0.1
+"""Translation along the axis per radian, in radii of the cloud, that makes a rotation a screw."""
+
+
+class PoseUncertainty(NamedTuple):
+    """What the pairs say about a small motion ``(omega, v)`` of the moved source.
+
+    The motion is ``y -> exp(omega) (y - centre) + centre + v``: rotation vector (radians) first,
+    then translation (unit of the clouds), both in the axes of the reference; `centre` is the
+    centroid of the reference. `information` is ``sum_i w_i J_i^T n_i n_i^T J_i``, `covariance` its
+    inverse times `variance`, the weighted mean square of the distances to the planes. `length` is
+    the radius that makes rotations and translations comparable, `weight` is ``sum_i w_i``.
+    """
+
+    information: Float[Array, "6 6"]
+    covariance: Float[Array, "6 6"]
+    variance: Float[Array, ""]
+    weight: Float[Array, ""]
+    centre: Float[Array, "3"]
+    length: Float[Array, ""]
+
+
+class WeakDirection(NamedTuple):
+    """A motion that changes no distance to the surfaces by much.
+
+    `axis` is a unit vector, `point` a point of the axis of a rotation or screw (for a translation:
+    the centre of the cloud). `strength` is the mean square change of the distances per unit motion
+    (a rotation moves a point one radius away by one radius); 1/3 is that of a ball of surfaces.
+    """
+
+    kind: Literal["rotation", "translation", "screw"]
+    axis: np.ndarray
+    point: np.ndarray
+    strength: float
+
+    @property
+    def name(self) -> str:
+        """For people: "rotation about axis (0.00, 0.00, 1.00)"."""
+        axis = ", ".join(f"{value:.2f}" for value in self.axis + 0.0)
+        verb = {"rotation": "rotation about axis", "screw": "screw motion about axis"}
+        return f"{verb.get(self.kind, 'translation along')} ({axis})"
+
+
+def pose_uncertainty(
+    transform: RigidTransform,
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    *,
+    reference_normals: Float[Array, "m 3"] | None = None,
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+    max_distance: Float[Array, ""] | float = _DEFAULT.max_distance,
+    trim: float = _DEFAULT.trim,
+    kernel: Kernel = _DEFAULT.kernel,
+    scale: Float[Array, ""] | float | None = None,
+    neighbors: int = _DEFAULT.neighbors,
+) -> PoseUncertainty:
+    """Information and covariance of a pose, from nearest pairs; options as for `point_to_plane`.
+
+    The covariance assumes independent errors of the distances. Nearest points of two samplings of
+    one surface share errors, so that it is a lower bound. Without any pair everything but `centre`
+    and `length` is zero; `weight` tells.
+
+    Raises:
+      ValueError: a shape is wrong, or the reference has not more than `neighbors` points.
+    """
+    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
+    if reference_normals is None:
+        reference_normals = normals(y, knn(y, neighbors, reference_mask), reference_mask)
+    moved = rigid.apply(frame.transform_in(where, transform), x)
+    pairs = closest_pairs(moved, y, source_mask, reference_mask, both_directions=False)
+    weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
+    return uncertainty_of_pairs(where, moved, y, reference_normals, pairs, weighting)
+
+
+def uncertainty_of_pairs(
+    where: frame.Frame,
+    moved: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    reference_normals: Float[Array, "m 3"],
+    pairs: Pairs,
+    weighting: Weighting,
+) -> PoseUncertainty:
+    """`pose_uncertainty` of given pairs of clouds in the frame."""
+    x, y = moved[pairs.source_index], reference[pairs.reference_index]
+    metric = plane_metric(x, y, reference_normals, pairs, weighting)
+    information, _ = normal_equations(x, y, metric)
+    weight = jnp.sum(jnp.trace(metric, axis1=1, axis2=2))
+    residual = x - y
+    squared = jnp.einsum("pi,pij,pj->", residual, metric, residual, precision="highest")
+    # Six parameters were fitted; fewer weights than that determine nothing.
+    variance = squared / jnp.maximum(weight - 6, 1)
+    units = jnp.concatenate([jnp.ones(3, x.dtype), jnp.full(3, where.length)])
+    scaling = units[:, None] * units[None, :]
+    return PoseUncertainty(
+        information=information / scaling * where.length**2,
+        covariance=_bounded_inverse(information) * variance * scaling,
+        variance=variance * where.length**2,
+        weight=weight,
+        centre=where.reference_centre,
+        length=where.length,
+    )
+
+
+def weak_directions(
+    uncertainty: PoseUncertainty, *, threshold: float = _DEFAULT.weak_threshold
+) -> tuple[WeakDirection, ...]:
+    """The translations and rotations whose `strength` is below `threshold`, weakest first (host).
+
+    Translations are eigenvectors of the translation's block of the information. Rotations are those
+    of what remains when every rotation may choose its best pivot (the Schur complement): a cylinder
+    turns about its own axis, wherever its centroid lies. A plane has two translations and one
+    rotation, a cylinder one of each, a sphere three rotations, an extruded profile one translation.
+    """
+    information = np.asarray(uncertainty.information, np.float64)
+    length, weight = float(uncertainty.length), float(uncertainty.weight)
+    centre = np.asarray(uncertainty.centre, np.float64)
+    if weight <= 0:
+        return ()
+    units = np.repeat([1.0, length], 3)
+    unit_free = information * np.outer(units, units) / (length**2 * weight)
+    strengths, axes = np.linalg.eigh(unit_free[3:, 3:])
+    found = [
+        WeakDirection("translation", _upright(axis), centre, float(strength))
+        for strength, axis in zip(strengths, axes.T, strict=True)
+        if strength < threshold
+    ]
+    held = strengths >= threshold
+    pivot = (axes[:, held] / strengths[held]) @ axes[:, held].T @ unit_free[3:, :3]
+    turning = unit_free[:3, :3] - unit_free[:3, 3:] @ pivot
+    strengths, axes = np.linalg.eigh((turning + turning.T) / 2)
+    for strength, axis in zip(strengths, axes.T, strict=True):
+        if strength < threshold:
+            shift = -pivot @ axis
+            kind = "screw" if abs(axis @ shift) > _PITCH else "rotation"
+            point = centre + length * np.cross(axis, shift)
+            found.append(WeakDirection(kind, _upright(axis), point, float(strength)))
+    return tuple(sorted(found, key=lambda direction: direction.strength))
+
+
+def _bounded_inverse(information: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    values, vectors = jnp.linalg.eigh(information)
+    floor = _SMALLEST_EIGENVALUE * values[-1]
+    values = jnp.where(values[-1] > 0, jnp.maximum(values, floor), 1)
+    return jnp.matmul(vectors / values[None, :], vectors.T, precision="highest")
+
+
+def _upright(axis: np.ndarray) -> np.ndarray:
+    """The axis or its opposite, so that the largest coordinate is positive."""
+    return axis * np.sign(axis[np.argmax(np.abs(axis))])
