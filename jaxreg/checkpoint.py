@@ -1,4 +1,7 @@
-"""Checkpoints of a run (Orbax), and released weights (plain arrays, no pickle)."""
+"""Checkpoints of a training run: the newest and the best state, by Orbax.
+
+Released weights are in `pretrained`.
+"""
 
 import contextlib
 import json
@@ -9,12 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import flatten_dict
 
 from jaxreg import config as configuration
 from jaxreg.config import Config
-
-_WEIGHTS = Path(__file__).parent / "weights"
 
 
 class Run:
@@ -64,8 +65,8 @@ class Run:
             file.write(json.dumps(entry) + "\n")
 
     def best(self, state: Any) -> Any:
-        """The averaged variables with the lowest validation error; `state` gives the structure."""
-        return _restore(self._best, state).average
+        """The state with the lowest validation error; the given `state` tells the structure."""
+        return _restore(self._best, state)
 
     def close(self) -> None:
         """Wait for what is still being written."""
@@ -81,7 +82,8 @@ class Run:
         if path.exists():
             lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
             path.write_text(
-                "".join(line for line in lines if json.loads(line)["step"] <= step), encoding="utf-8"
+                "".join(line for line in lines if json.loads(line)["step"] <= step),
+                encoding="utf-8",
             )
 
 
@@ -95,6 +97,24 @@ def open_run(workdir: str | Path, config: Config) -> Iterator[Run]:
         yield run
     finally:
         run.close()
+
+
+def best_config(workdir: str | Path) -> tuple[Config, float]:
+    """The configuration of the best checkpoint in `workdir`, and its validation error in degrees.
+
+    Raises:
+      ValueError: there is no checkpoint.
+    """
+    directory = Path(workdir).resolve() / "best"
+    if not directory.is_dir():
+        raise ValueError(
+            f"no checkpoint in {workdir}: give the --workdir of a run of train.py that has "
+            "validated at least once."
+        )
+    with ocp.CheckpointManager(directory) as manager:
+        if manager.latest_step() is None:
+            raise ValueError(f"{directory} holds no finished checkpoint: let train.py validate once.")
+        return _saved_config(manager)
 
 
 def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:

@@ -1,6 +1,12 @@
-"""Evaluation of a network on many pairs: vmapped batches in a stream of constant memory."""
+"""Evaluation on many pairs: made batch by batch, registered by any method, in constant memory.
 
-from collections.abc import Iterator
+A method is a function of a batch of pairs (a `Pair` with a leading axis on every array) to the
+stacked transforms from source to reference; it must not read `Pair.transform`.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -8,59 +14,125 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxreg.compilation import jit
-from jaxreg.config import Config, ModelConfig, PairConfig
+from jaxreg.config import ModelConfig, PairConfig
 from jaxreg.data.pairs import make_pair
 from jaxreg.model import Variables, iterate
+from jaxreg.refine.icp import icp
 from jaxreg.types import Pair, RigidTransform
 
+Method = Callable[[Pair], RigidTransform]
 
-def numbered_pair(
-    key: PRNGKeyArray, number: Array, shape: Float[Array, "p 3"], config: PairConfig
-) -> Pair:
-    """Pair `number` of the stream that `key` stands for; it depends on nothing but these."""
-    return make_pair(jax.random.fold_in(key, number), shape, config)
+_TEST, _VALIDATION = 0, 1  # Streams of random keys below the seed of the test pairs.
 
 
-def _register_batch(variables, key, numbers, shapes, *, pairs: PairConfig, model: ModelConfig):
-    batch = jax.vmap(lambda i, shape: numbered_pair(key, i, shape, pairs))(numbers, shapes)
-    register = lambda pair: iterate(variables, pair.source, pair.reference, config=model)[0]  # noqa: E731
-    return jax.vmap(register)(batch), batch.transform
+def test_key(seed: int) -> PRNGKeyArray:
+    """Key of the stream of test pairs; pair `i` of it is made from ``fold_in(key, i)``."""
+    return jax.random.fold_in(jax.random.key(seed), _TEST)
 
 
-_register_batch_jit = jit(_register_batch, static_argnames=("pairs", "model"))
+def validation_key(seed: int) -> PRNGKeyArray:
+    """Key of the stream of validation pairs."""
+    return jax.random.fold_in(jax.random.key(seed), _VALIDATION)
 
 
-def predict(
-    variables: Variables,
-    shapes: Float[np.ndarray, "s p 3"],
-    key: PRNGKeyArray,
-    *,
-    pairs: PairConfig,
-    model: ModelConfig,
-    batch: int = 8,
-) -> Iterator[tuple[RigidTransform, RigidTransform]]:
-    """Predicted and true transforms (numpy, stacked) of one pair a shape, batch by batch.
+def _make_batch(key, numbers, shapes, *, config: PairConfig) -> Pair:
+    one = lambda number, shape: make_pair(jax.random.fold_in(key, number), shape, config)  # noqa: E731
+    return jax.vmap(one)(numbers, shapes)
 
-    The last batch is filled up with repetitions, so that it compiles nothing new, and cut again.
+
+_make_batch_jit = jit(_make_batch, static_argnames="config")
+
+
+def pair_batches(
+    shapes: Float[np.ndarray, "s p 3"], key: PRNGKeyArray, *, config: PairConfig, batch: int
+) -> Iterator[tuple[Pair, int]]:
+    """One pair a shape, in batches; pair `i` depends on `key`, `i` and shape `i` only.
+
+    Every batch has the same size, so that nothing is compiled twice: the last is filled up with
+    pairs from the start. The number of pairs that count comes with each batch.
     """
     for start in range(0, len(shapes), batch):
         numbers = np.arange(start, start + batch) % len(shapes)
-        predicted, truth = _register_batch_jit(
-            variables, key, jnp.asarray(numbers), shapes[numbers], pairs=pairs, model=model
+        yield (
+            _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config),
+            min(batch, len(shapes) - start),
         )
-        count = min(batch, len(shapes) - start)
-        yield jax.tree.map(lambda x, c=count: np.asarray(x)[:c], (predicted, truth))
 
 
-def predict_all(
-    variables: Variables,
-    shapes: Float[np.ndarray, "s p 3"],
-    key: PRNGKeyArray,
-    *,
-    config: Config,
-    pairs: PairConfig,
-    batch: int = 8,
-) -> tuple[RigidTransform, RigidTransform]:
-    """Predicted and true transforms of one pair a shape, stacked."""
-    results = predict(variables, shapes, key, pairs=pairs, model=config.model, batch=batch)
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *results)
+def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:
+    """The true transforms of the pairs (numpy, stacked)."""
+    parts = [jax.tree.map(lambda x, c=n: np.asarray(x)[:c], pair.transform) for pair, n in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def evaluate_method(
+    method: Method,
+    batches: Iterator[tuple[Pair, int]],
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[RigidTransform, RigidTransform, float]:
+    """Predicted and true transforms (numpy, stacked), and the seconds that `method` takes a pair.
+
+    The first batch is registered twice and not timed the first time, since it compiles.
+    """
+    results, seconds, done = [], 0.0, 0
+    for pair, count in batches:
+        if not results:
+            jax.block_until_ready(method(pair))
+        begin = time.perf_counter()
+        predicted = jax.block_until_ready(method(pair))
+        seconds += time.perf_counter() - begin
+        done += pair.source.mask.shape[0]
+        results.append(
+            jax.tree.map(lambda x, c=count: np.asarray(x)[:c], (predicted, pair.transform))
+        )
+        progress(count)
+    predicted, truth = jax.tree.map(lambda *parts: np.concatenate(parts), *results)
+    return predicted, truth, seconds / done
+
+
+def _register_batch(variables: Variables, pair: Pair, *, config: ModelConfig) -> RigidTransform:
+    one = lambda source, reference: iterate(variables, source, reference, config=config)[0]  # noqa: E731
+    return jax.vmap(one)(pair.source, pair.reference)
+
+
+_register_batch_jit = jit(_register_batch, static_argnames="config")
+
+
+def network_method(variables: Variables, config: ModelConfig) -> Method:
+    """The trained network."""
+    return functools.partial(_register_batch_jit, variables, config=config)
+
+
+def identity_method(pair: Pair) -> RigidTransform:
+    """Doing nothing: the row that every method must beat."""
+    batch = pair.source.mask.shape[0]
+    return RigidTransform(np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3)))
+
+
+@jit
+def icp_method(pair: Pair) -> RigidTransform:
+    """Point-to-point ICP of this library from the identity."""
+    one = lambda source, reference: icp(  # noqa: E731
+        source.points,
+        reference.points,
+        iterations=50,
+        source_mask=source.mask,
+        reference_mask=reference.mask,
+    )
+    return jax.vmap(one)(pair.source, pair.reference)
+
+
+def host_method(
+    register: Callable[[np.ndarray, np.ndarray], RigidTransform],
+) -> Method:
+    """A method from a function of two numpy clouds (n, 3), (m, 3), called pair by pair."""
+
+    def method(pair: Pair) -> RigidTransform:
+        source, reference = jax.tree.map(np.asarray, (pair.source, pair.reference))
+        transforms = [
+            register(source.points[i][source.mask[i]], reference.points[i][reference.mask[i]])
+            for i in range(len(source.mask))
+        ]
+        return jax.tree.map(lambda *parts: np.stack(parts), *transforms)
+
+    return method

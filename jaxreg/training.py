@@ -16,17 +16,17 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg import checkpoint, report
 from jaxreg.compilation import jit
-from jaxreg.config import Config, TrainConfig
+from jaxreg.config import Config, PairConfig, TrainConfig
 from jaxreg.data import load_shapes
 from jaxreg.data.pairs import make_pair
-from jaxreg.evaluation import predict_all
+from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
 from jaxreg.losses import LossTerms, step_losses, total_loss
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.model import Variables, init_variables, iterate
 from jaxreg.types import Pair
 
-_TRAIN, _VALIDATION = 1, 2  # Streams of random keys below the seed.
+_TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
 
 
 class TrainState(NamedTuple):
@@ -41,7 +41,11 @@ class TrainState(NamedTuple):
 def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     """Adam with L2 inside, clipped, with linear warm-up and cosine decay."""
     schedule = optax.warmup_cosine_decay_schedule(
-        0.0, config.learning_rate, config.warmup, config.steps, config.final_learning_rate
+        0.0,
+        config.learning_rate,
+        min(config.warmup, config.steps // 2),
+        config.steps,
+        config.final_learning_rate,
     )
     return optax.chain(
         optax.clip_by_global_norm(config.clip),
@@ -52,9 +56,11 @@ def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 
 def create_train_state(config: Config) -> TrainState:
     """The state before the first step."""
-    variables = init_variables(jax.random.key(config.train.seed), config.model)
+    key = jax.random.fold_in(jax.random.key(config.train.seed), _INIT)
+    variables = init_variables(key, config.model)
     optimizer = create_optimizer(config.train).init(variables["params"])
-    return TrainState(jnp.zeros((), jnp.int32), variables, variables, optimizer)
+    average = jax.tree.map(jnp.copy, variables)  # A donated buffer must not appear twice.
+    return TrainState(jnp.zeros((), jnp.int32), variables, average, optimizer)
 
 
 def batch_loss(
@@ -80,9 +86,9 @@ def batch_loss(
         terms = jax.tree.map(jnp.sum, terms)
         return total_loss(terms, config.loss), terms, variables["batch_stats"]
 
-    loss, terms, statistics = jax.vmap(
-        pair_loss, axis_name=BATCH_AXIS, out_axes=(0, 0, None)
-    )(pairs.source, pairs.reference)
+    loss, terms, statistics = jax.vmap(pair_loss, axis_name=BATCH_AXIS, out_axes=(0, 0, None))(
+        pairs.source, pairs.reference
+    )
     return jnp.mean(loss), (jax.tree.map(jnp.mean, terms), statistics)
 
 
@@ -114,14 +120,29 @@ def train_step(
 
 
 def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[str, float]:
-    """Errors on the first `validation_pairs` pairs of the held-out shapes; the same every time."""
-    key = jax.random.fold_in(jax.random.key(config.data.test_seed), _VALIDATION)
-    shapes = shapes[: config.train.validation_pairs]
-    predicted, truth = predict_all(variables, shapes, key, config=config, pairs=config.pairs)
+    """Errors on the first `validation_pairs` pairs of the held-out shapes; the same every time.
+
+    The pairs are made as `[test_pairs]` says, from shapes that are not trained on.
+    """
+    batches = pair_batches(
+        shapes[: config.train.validation_pairs],
+        validation_key(config.data.test_seed),
+        config=config.test_pairs,
+        batch=config.train.batch,
+    )
+    method = network_method(variables, config.model)
+    predicted, truth, _ = evaluate_method(method, batches)
     metrics = evaluate_transforms(predicted, truth)
     return {
         name: float(metrics[name])
-        for name in ("mae_r_deg", "mie_r_deg", "mae_t", "median_rre_deg", "recall_1deg", "recall_5deg")
+        for name in (
+            "mae_r_deg",
+            "mie_r_deg",
+            "mae_t",
+            "median_rre_deg",
+            "recall_1deg",
+            "recall_5deg",
+        )
     }
 
 
@@ -137,16 +158,17 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
       FloatingPointError: the loss is not finite; says at which step. What was saved stays.
     """
     shapes, _ = load_shapes(
-        config.data, "train", root=root, points=_shape_points(config), seed=config.train.seed
+        config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
     )
     held_out, _ = load_shapes(
-        config.data, "validation", root=root, points=_shape_points(config), seed=config.train.seed
+        config.data, "validation", root=root, points=shape_points(config.test_pairs), seed=config.train.seed
     )
     step = jit(functools.partial(train_step, config=config), donate_argnums=0)
     on_device = jnp.asarray(shapes)
-    with checkpoint.open_run(workdir, config) as run, report.training_progress(
-        config.train.steps
-    ) as progress:
+    with (
+        checkpoint.open_run(workdir, config) as run,
+        report.training_progress(config.train.steps) as progress,
+    ):
         state = run.restore(create_train_state(config))
         while int(state.step) < config.train.steps:
             state, logged = step(state, on_device)
@@ -160,13 +182,26 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
                 )
             last = number == config.train.steps
             if number % config.train.validate_every == 0 or last:
-                entry |= {f"val_{k}": v for k, v in validate(state.average, held_out, config).items()}
+                entry |= {
+                    f"val_{k}": v for k, v in validate(state.average, held_out, config).items()
+                }
                 run.save(number, state, entry["val_mie_r_deg"])
             run.log(entry)
             progress(entry)
-        return run.best(create_train_state(config))
+        return run.best(state).average
 
 
-def _shape_points(config: Config) -> int:
-    factor = 2 if config.pairs.sampling == "disjoint" else 1
-    return factor * config.pairs.points
+def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
+    """The best (averaged) variables of a run, and its configuration.
+
+    Raises:
+      ValueError: there is no checkpoint in `workdir`.
+    """
+    config, _ = checkpoint.best_config(workdir)
+    with checkpoint.open_run(workdir, config) as run:
+        return run.best(create_train_state(config)).average, config
+
+
+def shape_points(pairs: PairConfig) -> int:
+    """Points that a shape must have, where its source can choose."""
+    return (2 if pairs.sampling == "disjoint" else 1) * pairs.points

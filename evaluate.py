@@ -1,0 +1,86 @@
+"""Evaluate: `python evaluate.py CONFIG.toml [--checkpoint DIR | --method NAME | --transforms FILE]`.
+
+Without any of them the released weights that the configuration (or --weights) names are evaluated.
+Every method meets the same pairs and the same metrics, in float64 from transforms.
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from jaxreg import scoring
+from jaxreg.compilation import enable_compilation_cache
+from jaxreg.config import Config
+from jaxreg.data import data_root
+from jaxreg.options import parse
+from jaxreg.report import results_table
+
+
+_CHOICE = ("checkpoint", "method", "transforms", "pairs", "batch", "save_transforms")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What evaluate.py takes."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    checkpoint: str = ""
+    """Working directory of a run of train.py; its best checkpoint is evaluated."""
+    method: str = ""
+    """Another method: see --method help."""
+    transforms: str = ""
+    """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
+    pairs: int = 0
+    """Evaluate the first N pairs only; 0 is all."""
+    batch: int = 8
+    """Pairs registered at once."""
+    json: str = ""
+    """Write the figures to this file."""
+    picture: str = ""
+    """Draw the first pair before and after to this PNG file."""
+    save_pairs: str = ""
+    """Write the pairs to this NPZ file, for --transforms by another program."""
+    save_transforms: str = ""
+    """Write the predicted transforms to this NPZ file."""
+    data_root: str = ""
+    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+
+
+def main() -> None:
+    """Parse, evaluate, print."""
+    path, options = parse(Options, description=__doc__)
+    enable_compilation_cache()
+    chosen = {name: getattr(options, name) for name in _CHOICE}
+    try:
+        root = data_root(options.data_root, path)
+        result = scoring.score(options.config, root=root, **chosen)
+        _write_extras(options, root)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    result["config"] = path.stem
+    Console().print(results_table([result], title=str(path)))
+    if options.json:
+        Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_extras(options: Options, root: Path | None) -> None:
+    if options.save_pairs:
+        _, batches = scoring.test_batches(options.config, root=root, pairs=options.pairs)
+        scoring.save_pairs(options.save_pairs, batches)
+    if options.picture:
+        scoring.draw_first_pair(
+            options.picture,
+            options.config,
+            root=root,
+            checkpoint=options.checkpoint,
+            method=options.method,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""The command line of the scripts: a configuration file first, then deviations from it."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from jaxreg.config import Config, load_config
+
+
+def parse(options: type, *, description: str, arguments: list[str] | None = None) -> tuple[Path, Any]:
+    """``CONFIG.toml [--option value ...] [--section.field value ...]`` as (path, `options`).
+
+    `options` is a dataclass with a field `config: Config` and defaults for the rest. A mistake ends
+    the program with status 2 and one message.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    asks_help = not arguments or arguments[0] in ("-h", "--help")
+    if asks_help:
+        path, config, rest = Path(), Config(), ["--help"]
+    else:
+        path, rest = Path(arguments[0]), arguments[1:]
+        try:
+            config = load_config(path)
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)  # noqa: T201
+            raise SystemExit(2) from None
+    program = f"{Path(sys.argv[0]).name} CONFIG.toml"
+    parsed = tyro.cli(
+        options, default=options(config=config), args=rest, prog=program, description=description
+    )
+    return path, parsed

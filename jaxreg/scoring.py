@@ -1,0 +1,167 @@
+"""From a configuration and the name of a method to the figures of RESULTS.md.
+
+Networks, classical methods and transforms that another program made meet the same pairs and the same
+metrics.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxreg import evaluation, metrics, report
+from jaxreg.config import Config
+from jaxreg.data import load_shapes, pair_sizes
+from jaxreg.pretrained import available_weights, load_pretrained
+from jaxreg.training import load_checkpoint, shape_points
+from jaxreg.types import Pair, RigidTransform
+
+METHODS = ("identity", "icp", "predecessor", "open3d_icp", "open3d_fgr", "open3d_fpfh_ransac",
+           "open3d_fgr_gicp", "open3d_ransac_icp", "small_gicp")  # fmt: skip
+"""Names of `choose_method`."""
+
+
+
+def choose_method(name: str) -> evaluation.Method:
+    """A method that needs no weights of ours, by name (one of `METHODS`).
+
+    Raises:
+      ValueError: the name is unknown, or what the method needs is not installed.
+    """
+    match name:
+        case "identity":
+            return evaluation.identity_method
+        case "icp":
+            return evaluation.icp_method
+    from jaxreg.classical import choose  # Open3D takes seconds to import.
+
+    return evaluation.host_method(choose(name))
+
+
+def _network(config: Config, checkpoint: str) -> tuple[str, evaluation.Method]:
+    """A trained network with the architecture it was trained with.
+
+    What costs nothing to change after training, the iterations and N_c, follows `config`.
+    """
+    if checkpoint:
+        label, (variables, trained) = f"checkpoint {checkpoint}", load_checkpoint(checkpoint)
+    else:
+        label, (variables, trained) = f"jaxreg ({config.weights})", load_pretrained(config.weights)
+    model = dataclasses.replace(
+        trained.model, iterations=config.model.iterations, n_inliers=config.model.n_inliers
+    )
+    return label, evaluation.network_method(variables, model)
+
+
+def test_batches(
+    config: Config, *, root: str | Path | None, pairs: int = 0, batch: int = 8
+) -> tuple[int, Iterator[tuple[Pair, int]]]:
+    """The number of test pairs, and the pairs in batches; `pairs` takes the first so many.
+
+    Raises:
+      ValueError: the data is missing or malformed, or the sizes of the pairs do not fit it.
+    """
+    points = shape_points(config.test_pairs)
+    shapes, _ = load_shapes(config.data, "test", root=root, points=points)
+    pair_sizes(config.test_pairs, shapes.shape[1])
+    shapes = shapes[: pairs or None]
+    key = evaluation.test_key(config.data.test_seed)
+    batch = min(batch, len(shapes))
+    return len(shapes), evaluation.pair_batches(shapes, key, config=config.test_pairs, batch=batch)
+
+
+def score(
+    config: Config,
+    *,
+    root: str | Path | None = None,
+    checkpoint: str = "",
+    method: str = "",
+    transforms: str = "",
+    pairs: int = 0,
+    batch: int = 8,
+    save_transforms: str = "",
+) -> dict[str, Any]:
+    """Evaluate one method on the test pairs of `config`; returns the figures, in degrees.
+
+    One of `checkpoint`, `method` and `transforms` chooses it; with none of them it is the released
+    weights that `config` names.
+
+    Raises:
+      ValueError: more than one method is chosen, or none; missing data, weights or files.
+    """
+    chosen = [x for x in (checkpoint, method, transforms) if x]
+    if len(chosen) > 1 or not (chosen or config.weights):
+        raise ValueError(
+            "choose one of --checkpoint, --method and --transforms; without any, --weights or the "
+            f"configuration must name released weights ({', '.join(available_weights())})."
+        )
+    count, batches = test_batches(config, root=root, pairs=pairs, batch=batch)
+    if transforms:
+        predicted, seconds = _read_transforms(transforms, count), None
+        truth = evaluation.true_transforms(batches)
+        label = f"transforms of {Path(transforms).name}"
+    else:
+        label, function = (
+            (method, choose_method(method)) if method else _network(config, checkpoint)
+        )
+        with report.counting_progress(count, label) as progress:
+            predicted, truth, seconds = evaluation.evaluate_method(function, batches, progress)
+    if save_transforms:
+        np.savez(save_transforms, **predicted._asdict())
+    figures = metrics.evaluate_transforms(predicted, truth)
+    return {"method": label, "dataset": config.data.name} | figures | {"seconds_per_pair": seconds}
+
+
+def _read_transforms(path: str, count: int) -> RigidTransform:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            transform = RigidTransform(arrays["rotation"], arrays["translation"])
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be an NPZ file with `rotation` (n, 3, 3) and `translation` (n, 3): {error}."
+        ) from None
+    if transform.rotation.shape != (count, 3, 3) or transform.translation.shape != (count, 3):
+        raise ValueError(
+            f"{path}: {count} pairs need rotation ({count}, 3, 3) and translation ({count}, 3), got "
+            f"{transform.rotation.shape} and {transform.translation.shape}."
+        )
+    return transform
+
+
+def save_pairs(path: str, batches: Iterator[tuple[Pair, int]]) -> None:
+    """Write pairs to an NPZ file: `source`, `reference` (n, p, 3) and their masks (n, p)."""
+    parts = [jax.tree.map(lambda x, c=count: np.asarray(x)[:c], pair) for pair, count in batches]
+    pair = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    np.savez(
+        path,
+        source=pair.source.points,
+        source_mask=pair.source.mask,
+        reference=pair.reference.points,
+        reference_mask=pair.reference.mask,
+    )
+
+
+def draw_first_pair(
+    path: str,
+    config: Config,
+    *,
+    root: str | Path | None = None,
+    checkpoint: str = "",
+    method: str = "",
+) -> None:
+    """Draw the first test pair before and after registration as PNG."""
+    _, batches = test_batches(config, root=root, pairs=1, batch=1)
+    pair, _ = next(batches)
+    if method:
+        function = choose_method(method)
+    else:
+        _, function = _network(config, checkpoint)
+    predicted = function(pair)
+    first = jax.tree.map(lambda x: np.asarray(x)[0], (pair, predicted))
+    (source, reference, truth), transform = first
+    report.plot_pair(
+        source.points[source.mask], reference.points[reference.mask], transform, path, truth=truth
+    )

@@ -1,0 +1,46 @@
+"""Train a network: `python train.py CONFIG.toml --workdir DIR [--section.field value ...]`.
+
+Run again with the same workdir to resume. Writes metrics.jsonl, curves.png, the newest and the best
+checkpoint by validation error.
+"""
+
+import dataclasses
+import sys
+from typing import Annotated
+
+import tyro
+
+from jaxreg.compilation import enable_compilation_cache
+from jaxreg.config import Config
+from jaxreg.data import data_root
+from jaxreg.options import parse
+from jaxreg.pictures import plot_curves
+from jaxreg.training import train
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What train.py takes."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    workdir: str = ""
+    """Directory of the run; one that holds a run is resumed."""
+    data_root: str = ""
+    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+
+
+def main() -> None:
+    """Parse, train, say where the results are."""
+    path, options = parse(Options, description=__doc__)
+    workdir = options.workdir or f"runs/{path.stem}"
+    enable_compilation_cache()
+    try:
+        train(options.config, workdir, root=data_root(options.data_root, path))
+    except (ValueError, FloatingPointError) as error:
+        sys.exit(f"error: {error}")
+    plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
+    print(f"best checkpoint, metrics.jsonl and curves.png: {workdir}")
+
+
+if __name__ == "__main__":
+    main()
