@@ -1,7 +1,7 @@
-"""RIENet's released weights (AAAI 2022), the single-neighbourhood predecessor, as variables of ours.
+"""RIENet's released weights (AAAI 2022), the single-neighbourhood predecessor, as our variables.
 
-The file is a plain ``.npz`` of the arrays of its PyTorch state dict under their own names; no torch is
-needed to read it.
+The file is a plain ``.npz`` of the arrays of its PyTorch state dict under their own names; no torch
+is needed to read it.
 """
 
 import zipfile

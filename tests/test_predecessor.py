@@ -1,7 +1,7 @@
 """Parity with RIENet: its released weights in our single-neighbourhood network give its outputs.
 
-Reads `rie_modelnet.npz` (weights) and `rie_parity.npz` (what its own code computed with them, stage by
-stage) from the folder `peers` beside the data; skips where they are absent.
+Reads `rie_modelnet.npz` (weights) and `rie_parity.npz` (what its own code computed with them, stage
+by stage) from the folder `peers` beside the data; skips where they are absent.
 """
 
 import os
