@@ -37,41 +37,66 @@ def matching_scores(
     return jax.nn.softmax(-distance, axis=1)
 
 
-@jax.custom_vjp
+class Incidence(NamedTuple):
+    """A neighbour index ``idx`` (n, k), read both ways.
+
+    Entries ``start[j] : start[j] + count[j]`` of `member` name the points that have j as a
+    neighbour, so that the transpose of a gather is a gather too. On a CPU XLA runs the scatter-add
+    that it would otherwise be serially, ten times slower.
+    """
+
+    idx: Int[Array, "n k"]
+    member: Int[Array, "nk"]
+    start: Int[Array, "n"]
+    count: Int[Array, "n"]
+
+
+def incidence(idx: Int[Array, "n k"]) -> Incidence:
+    """Both directions of a graph over one cloud; computed once per cloud."""
+    n, k = idx.shape
+    neighbor = idx.ravel()
+    member = jnp.repeat(jnp.arange(n, dtype=idx.dtype), k)[jnp.argsort(neighbor, stable=True)]
+    count = jnp.zeros(n, idx.dtype).at[neighbor].add(1)
+    return Incidence(idx, member, jnp.cumsum(count, dtype=idx.dtype) - count, count)
+
+
 def neighborhood_sum(
-    scores: Float[Array, "n m"], source_idx: Int[Array, "n k"], reference_idx: Int[Array, "m k"]
+    scores: Float[Array, "n m"],
+    source_idx: Int[Array, "n k"] | Incidence,
+    reference_idx: Int[Array, "m k"] | Incidence,
 ) -> Float[Array, "n m"]:
     """``S[i, j] = sum of scores[i', j'] over i' in N(i), j' in N(j)`` (Eq. 4), ``S = A_P M A_Q^T``.
 
-    Two passes of K row gathers; nothing of size n x m x k is formed.
+    Nothing of size n x m x k is formed. With one neighbour a point, the 1-NN, this is
+    ``scores[nearest_p][:, nearest_q]``.
     """
-    return _sum_rows(_sum_rows(scores, source_idx).T, reference_idx).T
+    source, reference = (
+        idx if isinstance(idx, Incidence) else incidence(idx) for idx in (source_idx, reference_idx)
+    )
+    # The sum is linear, and its transpose is written out below. Of the ways to tell JAX so, only
+    # custom_linear_solve works under vmap, in forward and in reverse mode; the identity stands in for
+    # a system that nobody solves.
+    return jax.lax.custom_linear_solve(
+        lambda x: x,
+        scores,
+        solve=lambda _, x: _gather_rows(_gather_rows(x, source).T, reference).T,
+        transpose_solve=lambda _, x: _collect_rows(_collect_rows(x, source).T, reference).T,
+    )
 
 
-def _sum_rows(scores: Float[Array, "n m"], idx: Int[Array, "p k"]) -> Float[Array, "p m"]:
-    return sum(scores[idx[:, r]] for r in range(idx.shape[1]))
+def _gather_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+    """``A x``: sum of the rows of the neighbours."""
+    return sum(x[graph.idx[:, r]] for r in range(graph.idx.shape[1]))
 
 
-def _adjacency(idx: Int[Array, "n k"], columns: int, dtype) -> Float[Array, "n m"]:
-    column = jnp.arange(columns)
-    return sum((idx[:, r, None] == column[None, :]).astype(dtype) for r in range(idx.shape[1]))
+def _collect_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+    """``A^T x``: sum of the rows of those that have this point as a neighbour."""
 
+    def add(r, total):
+        rows = graph.member[jnp.minimum(graph.start + r, graph.member.shape[0] - 1)]
+        return total + jnp.where((r < graph.count)[:, None], x[rows], 0)
 
-def _neighborhood_sum_fwd(scores, source_idx, reference_idx):
-    return neighborhood_sum(scores, source_idx, reference_idx), (source_idx, reference_idx)
-
-
-def _neighborhood_sum_bwd(residuals, cotangent):
-    # The transpose of a gather is a scatter-add, which XLA runs serially on a CPU and is ten times
-    # slower than these two products with 0/1 matrices: A_P^T g A_Q.
-    source_idx, reference_idx = residuals
-    n, m = cotangent.shape
-    a_p = _adjacency(source_idx, n, cotangent.dtype)
-    a_q = _adjacency(reference_idx, m, cotangent.dtype)
-    return jnp.matmul(jnp.matmul(a_p.T, cotangent), a_q), None, None
-
-
-neighborhood_sum.defvjp(_neighborhood_sum_fwd, _neighborhood_sum_bwd)
+    return jax.lax.fori_loop(0, jnp.max(graph.count), add, jnp.zeros_like(x))
 
 
 def final_distance(
@@ -104,27 +129,28 @@ class Maps(NamedTuple):
 def matching_maps(
     distance: Float[Array, "n m"],
     nearest_distance: Float[Array, "n m"] | None,
-    source_idx: Int[Array, "n k"],
-    reference_idx: Int[Array, "m k"],
+    source_graph: Incidence,
+    reference_graph: Incidence,
     *,
     alpha: float,
-    nearest_idx: tuple[Int[Array, "n k"], Int[Array, "m k"]] | None = None,
+    nearest_graphs: tuple[Incidence, Incidence] | None = None,
     valid: Bool[Array, "m"] | None = None,
 ) -> Maps:
     """The maps M, G, F (Eq. 3-5) from D and D-hat; None for D-hat is the single neighbourhood.
 
-    `nearest_idx` holds the graphs of the 1-NN clouds where they differ from those of the input.
+    `nearest_graphs` are those of the 1-NN clouds where they differ from those of the input.
     """
-    scores, total, k = matching_scores(distance, valid), distance, source_idx.shape[1]
+    graphs, k = (source_graph, reference_graph), source_graph.idx.shape[1]
+    scores, total = matching_scores(distance, valid), distance
     if nearest_distance is None:
-        dual = neighborhood_sum(scores, source_idx, reference_idx) / k
+        dual = neighborhood_sum(scores, *graphs) / k
     else:
         total, nearest = distance + nearest_distance, matching_scores(nearest_distance, valid)
-        if nearest_idx is None:  # The sum is linear: one graph, one sum.
-            dual = neighborhood_sum(scores + nearest, source_idx, reference_idx) / k
+        if nearest_graphs is None:  # The sum is linear: one graph, one sum.
+            dual = neighborhood_sum(scores + nearest, *graphs) / k
         else:
-            dual = neighborhood_sum(scores, source_idx, reference_idx) / k
-            dual = dual + neighborhood_sum(nearest, *nearest_idx) / k
+            dual = neighborhood_sum(scores, *graphs) / k
+            dual = dual + neighborhood_sum(nearest, *nearest_graphs) / k
     return Maps(scores, dual, matching_scores(final_distance(total, dual, alpha=alpha), valid))
 
 

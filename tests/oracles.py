@@ -1,4 +1,4 @@
-"""Independent references: slow loops in float64 numpy and scipy, written from the paper's equations.
+"""Independent references: slow float64 loops in numpy and scipy, from the equations of the paper.
 
 Nothing here imports jaxreg, except that the oracles of the networks read a tree of parameters.
 """
