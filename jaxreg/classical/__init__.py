@@ -1,1 +1,34 @@
 """Registration without learning, by the libraries that people use, on the same pairs."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxreg.types import RigidTransform
+
+
+def choose(name: str) -> Callable[[np.ndarray, np.ndarray], RigidTransform]:
+    """The baseline of a name, such as "open3d_fgr": a function of two clouds (n, 3), (m, 3).
+
+    Raises:
+      ValueError: no baseline has this name, or the library it needs is not installed.
+    """
+    # Imported here: config and metrics must not wait seconds for Open3D, nor need it.
+    from jaxreg.classical import open3d_baselines, small_gicp_baselines
+
+    functions = {
+        "open3d_icp": open3d_baselines.icp,
+        "open3d_icp_point_to_plane": open3d_baselines.icp_point_to_plane,
+        "open3d_icp_coarse_to_fine": open3d_baselines.icp_coarse_to_fine,
+        "open3d_fgr": open3d_baselines.fgr,
+        "open3d_fgr_icp": open3d_baselines.fgr_icp,
+        "open3d_fgr_gicp": open3d_baselines.fgr_gicp,
+        "open3d_fpfh_ransac": open3d_baselines.fpfh_ransac,
+        "open3d_ransac_icp": open3d_baselines.ransac_icp,
+        "open3d_ransac_gicp": open3d_baselines.ransac_gicp,
+        "small_gicp": small_gicp_baselines.gicp,
+    }
+    if name not in functions:
+        raise ValueError(f"no classical baseline '{name}': choose one of {', '.join(functions)}.")
+    (small_gicp_baselines if name == "small_gicp" else open3d_baselines).require()
+    return functions[name]
