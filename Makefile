@@ -3,9 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py benchmarks examples)
+TABLES := $(wildcard configs/modelnet40_*.toml)
+BASELINES := identity icp open3d_icp open3d_fgr open3d_fpfh_ransac open3d_fgr_gicp \
+  open3d_ransac_icp small_gicp
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help demo test slow lint fuzz mutants tables baselines clean
+.PHONY: help demo test slow lint types fuzz mutants tables baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -20,10 +23,12 @@ test: $(VENV)/.installed-dev  ## run the tests and report the coverage (10 minut
 slow: $(VENV)/.installed-dev  ## run the tests that `make test` leaves out
 	$(BIN)/python -m pytest -m slow
 
-lint: $(VENV)/.installed-dev  ## style, import order between the rooms, types
+lint: $(VENV)/.installed-dev  ## style, and the order of imports between the rooms
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/lint-imports
+
+types: $(VENV)/.installed-dev  ## what pyright says (not yet clean: numpy where a jax array is declared)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 fuzz: $(VENV)/.installed-dev  ## the tests with fresh seeds and many more examples
@@ -34,8 +39,15 @@ mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must
 
 baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
 
-tables: $(VENV)/.installed-baselines  ## every row of RESULTS.md that has weights
-	$(BIN)/python benchmarks/tables.py
+tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines
+	mkdir -p runs/tables
+	set -e; for config in $(basename $(notdir $(TABLES))); do \
+	  $(BIN)/python evaluate.py configs/$$config.toml --json runs/tables/$$config.json; \
+	  for method in $(BASELINES); do \
+	    $(BIN)/python evaluate.py configs/$$config.toml --method $$method --pairs 256 \
+	      --json runs/tables/$$config-$$method.json; \
+	  done; \
+	done
 
 clean:  ## remove the environment, caches and runs
 	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*

@@ -48,8 +48,11 @@ def test_local_methods_find_a_small_motion(name, seed):
 def test_global_methods_find_a_large_motion(name, seed):
     source, reference, truth = make_pair(seed, 120)
     result = errors(choose(name)(source, reference), truth)
-    assert result["mie_r_deg"] < (2 if name in GLOBAL else 0.05)
-    assert result["mie_t"] < (0.03 if name in GLOBAL else 0.001)
+    # Without refinement any pose counts whose matches lie within 1.5 spacings, some degrees.
+    assert result["recall_5deg"] == 1
+    if name in REFINED:
+        assert result["mie_r_deg"] < 0.05
+        assert result["mie_t"] < 0.001
 
 
 @pytest.mark.parametrize("name", LOCAL + GLOBAL + REFINED)
