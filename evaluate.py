@@ -20,8 +20,7 @@ from jaxreg.data import data_root
 from jaxreg.options import parse
 from jaxreg.report import results_table
 
-
-_CHOICE = ("checkpoint", "method", "transforms", "pairs", "batch", "save_transforms")
+_CHOICE = ("checkpoint", "predecessor", "method", "transforms", "pairs", "batch", "save_transforms")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +30,10 @@ class Options:
     config: Annotated[Config, tyro.conf.arg(name="")]
     checkpoint: str = ""
     """Working directory of a run of train.py; its best checkpoint is evaluated."""
+    predecessor: str = ""
+    """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
     method: str = ""
-    """Another method: see --method help."""
+    """Another method: identity, icp, or a baseline such as open3d_fgr (a wrong name lists them)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
     pairs: int = 0
@@ -70,7 +71,7 @@ def main() -> None:
 
 def _write_extras(options: Options, root: Path | None) -> None:
     if options.save_pairs:
-        _, batches = scoring.test_batches(options.config, root=root, pairs=options.pairs)
+        _, batches = scoring.pair_stream(options.config, root=root, pairs=options.pairs)
         scoring.save_pairs(options.save_pairs, batches)
     if options.picture:
         scoring.draw_first_pair(
@@ -78,6 +79,7 @@ def _write_extras(options: Options, root: Path | None) -> None:
             options.config,
             root=root,
             checkpoint=options.checkpoint,
+            predecessor=options.predecessor,
             method=options.method,
         )
 

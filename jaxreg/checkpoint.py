@@ -22,6 +22,7 @@ class Run:
     """The working directory of one training run: `latest/`, `best/` and `metrics.jsonl`."""
 
     def __init__(self, directory: Path, config: Config):
+        """Open the checkpoints below `directory`, which exists."""
         self.directory, self.config = directory, config
         self._latest, self._best = (
             ocp.CheckpointManager(
@@ -113,7 +114,9 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
         )
     with ocp.CheckpointManager(directory) as manager:
         if manager.latest_step() is None:
-            raise ValueError(f"{directory} holds no finished checkpoint: let train.py validate once.")
+            raise ValueError(
+                f"{directory} holds no finished checkpoint: let train.py validate once."
+            )
         return _saved_config(manager)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg import rigid
 from jaxreg.config import LossConfig, ModelConfig
-from jaxreg.invariants import edges, included_angles
+from jaxreg.invariants import included_angles
 from jaxreg.model import Graph, Step
 from jaxreg.neighbors import nearest_in, without_padding
 from jaxreg.numerics import safe_norm
@@ -36,7 +36,6 @@ def global_consistency(
     moved: PointCloud, reference: PointCloud, *, beta: float
 ) -> Float[Array, ""]:
     """L_gc (Eq. 14): Huber of the squared distance to the nearest point, both ways, summed."""
-
     # A NaN in a padded row would reach the derivative, through a product with a zero cotangent.
     moved = PointCloud(without_padding(*moved), moved.mask)
     reference = PointCloud(without_padding(*reference), reference.mask)

@@ -16,7 +16,15 @@ from jaxreg.config import Config, ModelConfig
 from jaxreg.features import DGCNN, relative_neighbors
 from jaxreg.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.invariants import geometric_structure
-from jaxreg.matching import Matches, feature_distance, match, matching_maps
+from jaxreg.matching import (
+    Incidence,
+    Matches,
+    feature_distance,
+    incidence,
+    match,
+    matching_maps,
+    neighborhood_sum,
+)
 from jaxreg.neighbors import knn, without_padding
 from jaxreg.procrustes import weighted_procrustes
 from jaxreg.types import PointCloud, Registration, RigidTransform
@@ -27,13 +35,14 @@ Variables = dict[str, Any]
 class Graph(NamedTuple):
     """The neighbourhoods of one cloud; a rigid motion does not change them.
 
-    `neighbors` serves features and inliers, `matching` the neighbourhood sum, `nearest` is the 1-NN
-    index. `own` is the graph of the 1-NN cloud itself, where the configuration asks for it.
+    `neighbors` serves features and inliers, `matching` the neighbourhood sum, `nearest` is the graph
+    with the 1-NN alone. `own` is the graph of the 1-NN cloud itself, where the configuration asks
+    for it.
     """
 
     neighbors: Int[Array, "n k"]
-    matching: Int[Array, "n km"]
-    nearest: Int[Array, "n"]
+    matching: Incidence
+    nearest: Incidence
     own: "Graph | None" = None
 
 
@@ -63,12 +72,12 @@ def neighborhood_graph(cloud: PointCloud, config: ModelConfig, *, own: bool | No
     if config.include_self:
         itself = jnp.arange(cloud.points.shape[0], dtype=neighbors.dtype)[:, None]
         neighbors = jnp.concatenate([itself, neighbors], axis=1)
-    nearest, nested = nearest_first[:, 0], None
+    matching, nearest = (incidence(nearest_first[:, :k]) for k in (config.k_matching, 1))
+    nested = None
     if config.one_nn == "own" if own is None else own:
-        nested = neighborhood_graph(
-            PointCloud(cloud.points[nearest], cloud.mask), config, own=False
-        )
-    return Graph(neighbors, nearest_first[:, : config.k_matching], nearest, nested)
+        nearest_points = cloud.points[nearest_first[:, 0]]
+        nested = neighborhood_graph(PointCloud(nearest_points, cloud.mask), config, own=False)
+    return Graph(neighbors, matching, nearest, nested)
 
 
 def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
@@ -83,7 +92,8 @@ def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
     )
     second = inliers.init(jax.random.fold_in(key, 1), structure, structure, mask, train=False)
     return {
-        kind: {"features": first[kind], "inliers": second[kind]} for kind in ("params", "batch_stats")
+        kind: {"features": first[kind], "inliers": second[kind]}
+        for kind in ("params", "batch_stats")
     }
 
 
@@ -130,20 +140,20 @@ def _both_features(variables, points, graph, mask, config, train):
     if graph.own is None:
         return (features, None), variables
     nearest, variables = point_features(
-        variables, points[graph.nearest], graph.own, mask, config=config, train=train
+        variables, points[graph.nearest.idx[:, 0]], graph.own, mask, config=config, train=train
     )
     return (features, nearest), variables
 
 
 def _match(source_features, reference_features, source_graph, reference_graph, reference, config):
     distance = feature_distance(source_features[0], reference_features[0])
-    nearest_distance, nearest_idx = None, None
+    nearest_distance, nearest_graphs = None, None
     if config.one_nn == "own":
         nearest_distance = feature_distance(source_features[1], reference_features[1])
-        nearest_idx = (source_graph.own.matching, reference_graph.own.matching)
+        nearest_graphs = (source_graph.own.matching, reference_graph.own.matching)
     elif config.one_nn == "gather":
         # The feature of the 1-NN point is that of the same point in the input cloud.
-        nearest_distance = distance[source_graph.nearest][:, reference_graph.nearest]
+        nearest_distance = neighborhood_sum(distance, source_graph.nearest, reference_graph.nearest)
     elif config.one_nn == "self":
         nearest_distance = distance
     maps = matching_maps(
@@ -152,7 +162,7 @@ def _match(source_features, reference_features, source_graph, reference_graph, r
         source_graph.matching,
         reference_graph.matching,
         alpha=config.alpha,
-        nearest_idx=nearest_idx,
+        nearest_graphs=nearest_graphs,
         valid=reference.mask,
     )
     return match(maps, reference.points)
@@ -199,9 +209,7 @@ def iterate(
         matches = _match(
             features, reference_features, source_graph, reference_graph, reference, config
         )
-        structures = [
-            _structure(x, source_graph.neighbors, config) for x in (points, matches.copy)
-        ]
+        structures = [_structure(x, source_graph.neighbors, config) for x in (points, matches.copy)]
         confidence, variables = _run(
             network, "inliers", variables, *structures, source.mask, train=train
         )

@@ -9,7 +9,9 @@ import tyro
 from jaxreg.config import Config, load_config
 
 
-def parse(options: type, *, description: str, arguments: list[str] | None = None) -> tuple[Path, Any]:
+def parse(
+    options: type, *, description: str, arguments: list[str] | None = None
+) -> tuple[Path, Any]:
     """``CONFIG.toml [--option value ...] [--section.field value ...]`` as (path, `options`).
 
     `options` is a dataclass with a field `config: Config` and defaults for the rest. A mistake ends

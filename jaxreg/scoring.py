@@ -12,41 +12,37 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxreg import evaluation, metrics, report
+from jaxreg import classical, evaluation, metrics, report
 from jaxreg.config import Config
 from jaxreg.data import load_shapes, pair_sizes
+from jaxreg.predecessor import load_predecessor
 from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.training import load_checkpoint, shape_points
 from jaxreg.types import Pair, RigidTransform
 
-METHODS = ("identity", "icp", "predecessor", "open3d_icp", "open3d_fgr", "open3d_fpfh_ransac",
-           "open3d_fgr_gicp", "open3d_ransac_icp", "small_gicp")  # fmt: skip
-"""Names of `choose_method`."""
-
-
 
 def choose_method(name: str) -> evaluation.Method:
-    """A method that needs no weights of ours, by name (one of `METHODS`).
+    """A method that needs no weights: `identity`, `icp` (ours), or a classical baseline.
 
     Raises:
-      ValueError: the name is unknown, or what the method needs is not installed.
+      ValueError: the name is unknown (the message lists them), or its library is not installed.
     """
     match name:
         case "identity":
             return evaluation.identity_method
         case "icp":
             return evaluation.icp_method
-    from jaxreg.classical import choose  # Open3D takes seconds to import.
-
-    return evaluation.host_method(choose(name))
+    return evaluation.host_method(classical.choose(name))
 
 
-def _network(config: Config, checkpoint: str) -> tuple[str, evaluation.Method]:
+def _network(config: Config, checkpoint: str, predecessor: str) -> tuple[str, evaluation.Method]:
     """A trained network with the architecture it was trained with.
 
     What costs nothing to change after training, the iterations and N_c, follows `config`.
     """
-    if checkpoint:
+    if predecessor:
+        label, (variables, trained) = "predecessor", load_predecessor(predecessor)
+    elif checkpoint:
         label, (variables, trained) = f"checkpoint {checkpoint}", load_checkpoint(checkpoint)
     else:
         label, (variables, trained) = f"jaxreg ({config.weights})", load_pretrained(config.weights)
@@ -56,7 +52,7 @@ def _network(config: Config, checkpoint: str) -> tuple[str, evaluation.Method]:
     return label, evaluation.network_method(variables, model)
 
 
-def test_batches(
+def pair_stream(
     config: Config, *, root: str | Path | None, pairs: int = 0, batch: int = 8
 ) -> tuple[int, Iterator[tuple[Pair, int]]]:
     """The number of test pairs, and the pairs in batches; `pairs` takes the first so many.
@@ -78,6 +74,7 @@ def score(
     *,
     root: str | Path | None = None,
     checkpoint: str = "",
+    predecessor: str = "",
     method: str = "",
     transforms: str = "",
     pairs: int = 0,
@@ -86,26 +83,27 @@ def score(
 ) -> dict[str, Any]:
     """Evaluate one method on the test pairs of `config`; returns the figures, in degrees.
 
-    One of `checkpoint`, `method` and `transforms` chooses it; with none of them it is the released
-    weights that `config` names.
+    One of `checkpoint`, `predecessor` (its weights file), `method` and `transforms` chooses it; with
+    none of them it is the released weights that `config` names.
 
     Raises:
       ValueError: more than one method is chosen, or none; missing data, weights or files.
     """
-    chosen = [x for x in (checkpoint, method, transforms) if x]
+    chosen = [x for x in (checkpoint, predecessor, method, transforms) if x]
     if len(chosen) > 1 or not (chosen or config.weights):
         raise ValueError(
-            "choose one of --checkpoint, --method and --transforms; without any, --weights or the "
-            f"configuration must name released weights ({', '.join(available_weights())})."
+            "choose one of --checkpoint, --predecessor, --method and --transforms; without any, "
+            "--weights or the configuration must name released weights "
+            f"({', '.join(available_weights())})."
         )
-    count, batches = test_batches(config, root=root, pairs=pairs, batch=batch)
+    count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
     if transforms:
         predicted, seconds = _read_transforms(transforms, count), None
         truth = evaluation.true_transforms(batches)
         label = f"transforms of {Path(transforms).name}"
     else:
         label, function = (
-            (method, choose_method(method)) if method else _network(config, checkpoint)
+            (method, choose_method(method)) if method else _network(config, checkpoint, predecessor)
         )
         with report.counting_progress(count, label) as progress:
             predicted, truth, seconds = evaluation.evaluate_method(function, batches, progress)
@@ -150,15 +148,16 @@ def draw_first_pair(
     *,
     root: str | Path | None = None,
     checkpoint: str = "",
+    predecessor: str = "",
     method: str = "",
 ) -> None:
     """Draw the first test pair before and after registration as PNG."""
-    _, batches = test_batches(config, root=root, pairs=1, batch=1)
+    _, batches = pair_stream(config, root=root, pairs=1, batch=1)
     pair, _ = next(batches)
     if method:
         function = choose_method(method)
     else:
-        _, function = _network(config, checkpoint)
+        _, function = _network(config, checkpoint, predecessor)
     predicted = function(pair)
     first = jax.tree.map(lambda x: np.asarray(x)[0], (pair, predicted))
     (source, reference, truth), transform = first

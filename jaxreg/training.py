@@ -115,7 +115,7 @@ def train_step(
     # A young average follows faster, so that it does not remember the initial weights for long.
     decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
     average = optax.incremental_update(variables, state.average, 1 - decay)
-    logged = {"loss": loss, "gradient_norm": optax.global_norm(gradient), **terms._asdict()}
+    logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms._asdict()}
     return TrainState(state.step + 1, variables, average, optimizer), logged
 
 
@@ -161,7 +161,11 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
         config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
     )
     held_out, _ = load_shapes(
-        config.data, "validation", root=root, points=shape_points(config.test_pairs), seed=config.train.seed
+        config.data,
+        "validation",
+        root=root,
+        points=shape_points(config.test_pairs),
+        seed=config.train.seed,
     )
     step = jit(functools.partial(train_step, config=config), donate_argnums=0)
     on_device = jnp.asarray(shapes)

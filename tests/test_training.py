@@ -1,0 +1,135 @@
+"""Training: unsupervised, resumable bit for bit, and stopped by a loss that is not finite."""
+
+import dataclasses
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxreg import checkpoint, training
+from jaxreg.config import Config, from_dict
+from jaxreg.types import RigidTransform
+
+pytestmark = [pytest.mark.float32, pytest.mark.loose]
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return from_dict(
+        {
+            "model": {"channels": [4, 8], "width": 8, "n_inliers": 12, "iterations": 2, "k": 3},
+            "pairs": {"points": 32, "kept": 24},
+            "data": {"name": "shapes", "train_shapes": 8, "test_shapes": 4, "validation_share": 0.5},
+            "train": {"steps": 4, "batch": 2, "validate_every": 2, "validation_pairs": 2, "warmup": 1},
+        }
+    )
+
+
+def test_the_true_transform_changes_no_gradient(config, seed):
+    shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
+    pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
+    lie = RigidTransform(*jax.tree.map(lambda x: x * 0 + seed + 7.0, pairs.transform))
+    state = training.create_train_state(config)
+    gradient = jax.jit(
+        jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True)
+    )
+    arguments = state.variables["params"], state.variables["batch_stats"]
+    honest, _ = gradient(*arguments, pairs)
+    lied, _ = gradient(*arguments, pairs._replace(transform=lie))
+    assert any(jnp.any(leaf != 0) for leaf in jax.tree.leaves(honest))
+    jax.tree.map(np.testing.assert_array_equal, honest, lied)
+
+
+def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
+    """A law of gradients: a short enough step along minus the gradient lowers the loss."""
+    shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
+    state = training.create_train_state(config)
+    pairs = training.draw_batch(state.step, shapes, config)
+    params, statistics = state.variables["params"], state.variables["batch_stats"]
+    loss = jax.jit(functools.partial(training.batch_loss, config=config))
+    gradient, _ = jax.grad(training.batch_loss, has_aux=True)(
+        params, statistics, pairs, config=config
+    )
+    square = sum(jnp.sum(g * g) for g in jax.tree.leaves(gradient))
+    before, _ = loss(params, statistics, pairs)
+    length = 1e-3 * before / square
+    after, _ = loss(
+        jax.tree.map(lambda p, g: p - length * g, params, gradient), statistics, pairs
+    )
+    assert after < before
+
+
+def test_a_resumed_run_equals_an_unbroken_one(config, tmp_path, monkeypatch):
+    unbroken = training.train(config, tmp_path / "unbroken")
+    step, calls = training.train_step, 0
+
+    def killed(*arguments, **options):
+        nonlocal calls
+        calls += 1
+        return step(*arguments, **options)
+
+    class Killed(Exception):
+        pass
+
+    def log(run, entry, original=checkpoint.Run.log):
+        original(run, entry)
+        if entry["step"] == 3:
+            raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint.Run, "log", log)
+        with pytest.raises(Killed):
+            training.train(config, tmp_path / "broken")
+    resumed = training.train(config, tmp_path / "broken")
+    jax.tree.map(np.testing.assert_array_equal, unbroken, resumed)
+    lines = [
+        [json.loads(line) for line in (tmp_path / run / "metrics.jsonl").read_text().splitlines()]
+        for run in ("unbroken", "broken")
+    ]
+    assert [entry["step"] for entry in lines[1]] == [1, 2, 3, 4]
+    assert lines[0] == lines[1]
+    variables, saved = training.load_checkpoint(tmp_path / "broken")
+    jax.tree.map(np.testing.assert_array_equal, variables, resumed)
+    assert saved == config
+
+
+def test_the_best_checkpoint_has_the_lowest_validation_error(config, tmp_path, monkeypatch):
+    errors = iter([5.0, 9.0])
+    seen = []
+
+    def validate(variables, shapes, config):
+        seen.append(jax.tree.map(np.asarray, variables))
+        return {"mie_r_deg": next(errors)}
+
+    monkeypatch.setattr(training, "validate", validate)
+    best = training.train(config, tmp_path)
+    assert len(seen) == 2
+    jax.tree.map(np.testing.assert_array_equal, best, seen[0])
+    assert checkpoint.best_config(tmp_path)[1] == 5.0
+
+
+def test_another_configuration_does_not_resume(config, tmp_path):
+    training.train(config, tmp_path)
+    other = dataclasses.replace(config, loss=dataclasses.replace(config.loss, beta=0.5))
+    with pytest.raises(ValueError, match=r"loss.beta: 0.01 there, 0.5 here"):
+        training.train(other, tmp_path)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(config, tmp_path, monkeypatch):
+    clean = training.load_shapes
+
+    def poisoned(*arguments, **options):
+        clouds, labels = clean(*arguments, **options)
+        return clouds * np.float32(np.nan), labels
+
+    monkeypatch.setattr(training, "load_shapes", poisoned)
+    with pytest.raises(FloatingPointError, match="step 1"):
+        training.train(config, tmp_path)
+
+
+def test_no_checkpoint_is_an_error_that_says_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match="--workdir"):
+        training.load_checkpoint(tmp_path)
