@@ -1,0 +1,35 @@
+"""Padded sizes and the pairs of the trees against brute force."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxreg import rigid
+from jaxreg.refine.pairing import closest_pairs
+from jaxreg.refine.tree import index_cloud, padded_size, tree_pairs
+from jaxreg.types import RigidTransform
+
+
+def test_few_sizes_cover_all_counts():
+    counts = np.arange(1, 100_000)
+    sizes = np.array([padded_size(int(count)) for count in counts])
+    assert (sizes >= counts).all()
+    assert (sizes[counts >= 4] <= 1.25 * counts[counts >= 4]).all()
+    assert len(np.unique(sizes)) < 70
+
+
+@pytest.mark.parametrize("both_directions", [False, True])
+def test_pairs_equal_brute_force(both_directions, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(70, 3)), rng.normal(size=(90, 3))
+    pose = RigidTransform(Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3))
+    clouds = [index_cloud(points, neighbors=5) for points in (x, y)]
+    pairs = tree_pairs(pose, *clouds, 1, both_directions=both_directions)
+    moved = rigid.apply(RigidTransform(*map(jnp.asarray, pose)), jnp.asarray(x))
+    expected = closest_pairs(moved, jnp.asarray(y), None, None, both_directions=both_directions)
+    count = len(expected.mask)
+    np.testing.assert_array_equal(pairs.source_index[:count], expected.source_index)
+    np.testing.assert_array_equal(pairs.reference_index[:count], expected.reference_index)
+    assert pairs.mask[:count].all()
+    assert not pairs.mask[count:].any()

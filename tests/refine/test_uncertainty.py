@@ -1,0 +1,126 @@
+"""Covariance against Monte Carlo, and free motions of known shapes by name."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxreg import rigid
+from jaxreg.refine import uncertainty as rooms
+from jaxreg.refine.point_to_plane import point_to_plane
+from jaxreg.refine.uncertainty import weak_directions
+from jaxreg.types import RigidTransform
+
+pose_uncertainty = jax.jit(rooms.pose_uncertainty, static_argnames=("kernel", "trim", "neighbors"))
+TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
+
+
+def shapes(rng, n=800):
+    flat, angle, height = (
+        rng.uniform(-1, 1, (n, 2)),
+        rng.uniform(0, 2 * np.pi, n),
+        rng.uniform(-1, 1, n),
+    )
+    ball = rng.normal(size=(n, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    box = rng.uniform(-1, 1, (n, 3))
+    box[np.arange(n), rng.integers(0, 3, n)] = rng.choice([-1, 1], n)
+    return {
+        "plane": np.column_stack([flat, 0 * angle]),
+        "cylinder": np.column_stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), height]),
+        "half cylinder": np.column_stack(
+            [0.5 * np.cos(angle / 2), 0.5 * np.sin(angle / 2), height]
+        ),
+        "sphere": ball,
+        "cap": np.column_stack([ball[:, :2], np.abs(ball[:, 2])]),
+        "box": box,
+    }
+
+
+FREE = {
+    "plane": ["rotation", "translation", "translation"],
+    "cylinder": ["rotation", "translation"],
+    "half cylinder": ["rotation", "translation"],
+    "sphere": ["rotation"] * 3,
+    "cap": ["rotation"] * 3,
+    "box": [],
+}
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("name", FREE)
+def test_free_motions_are_named(name, factor, seed):
+    rng = np.random.default_rng(seed)
+    points = shapes(rng)[name]
+    points = factor * (points @ TURN.T + 3 + 0.003 * rng.normal(size=points.shape))
+    cloud = jnp.asarray(points)
+    uncertainty = pose_uncertainty(rigid.identity(cloud.dtype), cloud, cloud)
+    weak = weak_directions(uncertainty)
+    assert sorted(direction.kind for direction in weak) == FREE[name]
+    if "cylinder" in name:
+        for direction in weak:
+            assert abs(direction.axis @ TURN[:, 2]) > 0.99
+            assert "axis (" in direction.name or "along (" in direction.name
+    if name == "half cylinder":
+        point = next(d.point for d in weak if d.kind == "rotation")
+        offset = np.cross(point / factor - 3, TURN[:, 2])
+        assert np.linalg.norm(offset) < 0.1  # the axis is the cylinder's, not the centroid's
+    if name == "plane":
+        rotation = next(d for d in weak if d.kind == "rotation")
+        assert abs(rotation.axis @ TURN[:, 2]) > 0.99
+
+
+def test_covariance_is_that_of_repeated_measurements(seed):
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform(-1, 1, (150, 2))
+    points = np.column_stack([uv, 0.5 * np.sin(2 * uv[:, 0]) * np.cos(2 * uv[:, 1])]) + 5
+    slope = np.column_stack(
+        [np.cos(2 * uv[:, 0]) * np.cos(2 * uv[:, 1]), -np.sin(2 * uv[:, 0]) * np.sin(2 * uv[:, 1])]
+    )
+    normal = np.column_stack([-slope, np.ones(150)])
+    normal = jnp.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    reference, sigma = jnp.asarray(points), 1e-3
+    noise = sigma * rng.normal(size=(300, 150, 3))
+    options = {"kernel": "none", "reference_normals": normal}
+
+    def measure(noise):
+        pose = point_to_plane(reference + noise, reference, iterations=4, **options)
+        uncertainty = pose_uncertainty(pose, reference + noise, reference, **options)
+        return pose, uncertainty
+
+    poses, uncertainty = jax.jit(jax.vmap(measure))(jnp.asarray(noise))
+    centre = points.mean(0)
+    motion = np.concatenate(
+        [
+            Rotation.from_matrix(np.asarray(poses.rotation)).as_rotvec(),
+            np.asarray(poses.translation) + np.asarray(poses.rotation) @ centre - centre,
+        ],
+        axis=1,
+    )
+    predicted = np.asarray(uncertainty.covariance).mean(0)
+    np.testing.assert_allclose(motion.std(0), np.sqrt(np.diag(predicted)), rtol=0.2)
+    np.testing.assert_allclose(np.asarray(uncertainty.variance).mean(), sigma**2, rtol=0.1)
+    whitened = np.linalg.solve(np.linalg.cholesky(predicted), motion.T)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.3)
+
+
+def test_finite_without_pairs_and_without_normals():
+    line = jnp.linspace(0, 1, 20)[:, None] * jnp.array([[1.0, 2, 3]])
+    identity = rigid.identity(line.dtype)
+    far = pose_uncertainty(identity, line, line + 100, max_distance=0.1)
+    assert far.weight == 0
+    assert weak_directions(far) == ()
+    for uncertainty in (far, pose_uncertainty(identity, line, line)):
+        assert all(np.isfinite(leaf).all() for leaf in uncertainty)
+
+
+def test_padding_changes_nothing(seed):
+    points = jnp.asarray(shapes(np.random.default_rng(seed), 60)["box"])
+    pose = RigidTransform(jnp.eye(3), jnp.array([0.01, 0.0, 0.0]))
+    padded = jnp.concatenate([points, jnp.full((5, 3), jnp.nan)])
+    mask = jnp.arange(65) < 60
+    plain = pose_uncertainty(pose, points, points)
+    masked = pose_uncertainty(pose, padded, padded, source_mask=mask, reference_mask=mask)
+    for a, b in zip(plain, masked, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-15)
