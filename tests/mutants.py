@@ -28,7 +28,7 @@ MUTANTS = [
     Mutant("procrustes", "skew = skew.T - skew", "skew = skew - skew.T"),
     Mutant("neighbors", "order[None, :] == jnp.arange(n)[:, None]", "jnp.zeros((n, n), bool)"),
     Mutant("neighbors", "order = jnp.lexsort(points.T)", "order = jnp.arange(n)"),
-    Mutant("numerics", "jnp.sqrt(jnp.where(positive, x, 1))", "jnp.sqrt(x)"),
+    Mutant("numerics", "jnp.sqrt(jnp.where(zero, 1, x))", "jnp.sqrt(x)"),
     Mutant("numerics", "jnp.where(degenerate, 1, dot)", "dot"),
     Mutant(
         "rigid", "RigidTransform(rotation, -translation)", "RigidTransform(rotation, translation)"
@@ -43,12 +43,15 @@ MUTANTS = [
 ]
 
 
-def survives(mutant: Mutant) -> bool:
-    """Whether the tests pass all the same.
+def check(mutant: Mutant) -> None:
+    """Raises ValueError when the module does not hold the text exactly once."""
+    count = (ROOT / "jaxreg" / f"{mutant.module}.py").read_text("utf-8").count(mutant.text)
+    if count != 1:
+        raise ValueError(f"{mutant.module}.py holds {mutant.text!r} {count} times: write it anew.")
 
-    Raises:
-      ValueError: the module does not hold the text exactly once.
-    """
+
+def survives(mutant: Mutant) -> bool:
+    """Whether the tests pass all the same."""
     with tempfile.TemporaryDirectory() as directory:
         copy = Path(directory)
         for name in ("jaxreg", "tests"):
@@ -56,10 +59,6 @@ def survives(mutant: Mutant) -> bool:
         shutil.copy(ROOT / "pyproject.toml", copy)
         path = copy / "jaxreg" / f"{mutant.module}.py"
         source = path.read_text(encoding="utf-8")
-        if source.count(mutant.text) != 1:
-            raise ValueError(
-                f"{mutant.module}.py holds {mutant.text!r} {source.count(mutant.text)}x"
-            )
         path.write_text(source.replace(mutant.text, mutant.mutated), encoding="utf-8")
         tests = mutant.tests or f"tests/test_{mutant.module}.py"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", tests]
@@ -72,6 +71,8 @@ def survives(mutant: Mutant) -> bool:
 def main() -> None:
     """Run every mutant; exit 1 when one survives."""
     survivors = 0
+    for mutant in MUTANTS:
+        check(mutant)
     for mutant in MUTANTS:
         alive = survives(mutant)
         survivors += alive
