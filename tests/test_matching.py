@@ -1,7 +1,5 @@
 """Matching against loops written from Eq. 3-6, and the laws of the maps."""
 
-import functools
-
 import jax
 import numpy as np
 import pytest
@@ -93,6 +91,15 @@ def test_neighborhood_sum_counts_repeated_neighbours(rng):
     np.testing.assert_allclose(result, 9 * scores, rtol=1e-14)
 
 
+def test_incidence_names_those_that_have_a_point_as_a_neighbour(rng):
+    idx = graph(rng, N)
+    result = jax.jit(matching.incidence)(idx)
+    np.testing.assert_array_equal(result.idx, idx)
+    for j in range(N):
+        members = np.asarray(result.member)[result.start[j] : result.start[j] + result.count[j]]
+        assert sorted(members) == [i for i in range(N) if j in idx[i]]
+
+
 def test_derivative_of_the_neighborhood_sum_is_its_transpose(rng):
     scores, cotangent = rng.uniform(size=(2, N, M))
     source_idx, reference_idx = graph(rng, N), graph(rng, M)
@@ -118,8 +125,17 @@ def test_maps_entry_by_entry(rng, nearest):
     graphs = graph(rng, N), graph(rng, M)
     own = (graph(rng, N), graph(rng, M)) if nearest == "own graph" else None
     nearest_distance = None if nearest is None else rng.uniform(0, 3, (N, M))
-    run = jax.jit(functools.partial(matching.matching_maps, alpha=ALPHA))
-    result = run(distance, nearest_distance, *graphs, nearest_idx=own)
+
+    @jax.jit
+    def run(distance, nearest_distance, graphs, own):
+        both_ways = [
+            None if g is None else tuple(map(matching.incidence, g)) for g in (graphs, own)
+        ]
+        return matching.matching_maps(
+            distance, nearest_distance, *both_ways[0], alpha=ALPHA, nearest_graphs=both_ways[1]
+        )
+
+    result = run(distance, nearest_distance, graphs, own)
     expected = oracles.maps(distance, nearest_distance, *graphs, ALPHA, own)
     for name, got, want in zip(("M", "G", "F"), result, expected, strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-15, err_msg=name)
