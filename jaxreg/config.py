@@ -187,6 +187,99 @@ class RefineConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RegisterConfig:
+    """Registration of two scans on the host (`jaxreg.register`)."""
+
+    search_points: int = 2048
+    """Most points of a cloud in the search for a pose; larger clouds are averaged in voxels."""
+    feature_neighbors: int = 64
+    """Most neighbours of a point in its histograms."""
+    feature_radius: float = 5.0
+    """Radius of the histograms, in spacings of the points."""
+    correspondences: int = 1024
+    """Candidate correspondences."""
+    tolerance: float = 2.0
+    """Error of a right correspondence, in spacings."""
+    seeds: int = 64
+    """Poses made from the correspondences."""
+    partners: int = 24
+    """Correspondences that a pose is made from."""
+    starts: int = 576
+    """Rotations that cover SO(3), for shapes whose features say little."""
+    limited_deg: float = 80.0
+    """Largest rotation between two clouds that `rotation = "limited"` looks for."""
+    verified: int = 6
+    """Poses that are polished and compared before the best is refined."""
+    reach: float = 1.5
+    """A point agrees with the other cloud when it is within this many spacings of it."""
+    doubtful: float = 0.5
+    """Disagreement (0 to 1) of the best pose from features above which the covering is tried too."""
+    refine_points: int = 8192
+    """Most points of a cloud in the refinement."""
+    refine_iterations: int = 15
+    """Most iterations of the refinement."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DenseConfig:
+    """Global registration without learning (`jaxreg.dense`). Lengths are in units in which a usual
+    shape fills the unit sphere, angles in radians."""
+
+    unit: float = 0.0
+    """That unit, in the unit of the clouds. 0: twice the clouds' root mean square radius."""
+    radii: tuple[float, ...] = (0.2, 0.4, 0.8)
+    """Radii of the moment descriptors."""
+    normal_radius: float = 0.15
+    """Radius of the Gaussian neighbourhood of a normal."""
+    matches: int = 3
+    """Most similar points of every point that become candidates, in both directions."""
+    candidates: int = 768
+    """Candidates kept, the clearest first; each gives a pose."""
+    partners: int = 12
+    """Other candidates that a pose is computed from."""
+    tolerance: float = 0.08
+    """Change of a distance at which two candidates stop being compatible."""
+    normal_tolerance: float = 0.3
+    """The same for the cosines of normals and lines."""
+    grid_cells: int = 24
+    """Cells of the nearest-point grid along each axis."""
+    screen_width: float = 0.06
+    """Width of the Gaussian overlap that all poses are screened by."""
+    screened: int = 32
+    """Distinct poses that are refined coarsely."""
+    distinct_angle: float = 0.26
+    """Poses are distinct when they turn by more than this from each other,"""
+    distinct_distance: float = 0.15
+    """or move the centroid of the source farther apart than this."""
+    coarse_step: int = 2
+    """Every so-manieth point is screened and refined coarsely."""
+    coarse_widths: tuple[float, ...] = (0.15, 0.12, 0.1, 0.08, 0.06, 0.05)
+    """Gaussian width of every coarse iteration."""
+    coarse_thickness: float = 0.1
+    """Weight of the distance along a surface, against that across it, in these."""
+    finalists: int = 6
+    """Poses that are refined finely and then ranked."""
+    fine_widths: tuple[float, ...] = (0.1, 0.08, 0.06, 0.05, 0.05)
+    """Gaussian width of every fine iteration."""
+    final_widths: tuple[float, ...] = (0.06,) * 3 + (0.05,) * 7
+    """Gaussian width of every iteration of the pose that is ranked first."""
+    thickness: float = 0.01
+    """Variance across a surface, in units of the variance along it."""
+    match_width: float = 0.05
+    """Width of the distance at which points count as near, in the ranking."""
+    plane_width: float = 0.02
+    """Width of the distance from the other surface's plane at which they match."""
+    rim_radius: float = 0.3
+    """Radius at which a surface is seen to be open."""
+    rim: float = 0.25
+    """Openness at which a surface counts as ending."""
+    contradiction: float = 0.5
+    """Cost of a point that is near without a match, in points that match."""
+    beside: float = 1.0
+    """Cost of a point that lies beside the inside of the other surface."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """All of it."""
 

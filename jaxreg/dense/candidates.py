@@ -1,0 +1,74 @@
+"""Candidate correspondences: the best matches of every point, in both directions."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Candidates(NamedTuple):
+    """``source[source_index[c]]`` may be ``reference[reference_index[c]]``; False is no candidate."""
+
+    source_index: Int[Array, "c"]
+    reference_index: Int[Array, "c"]
+    mask: Bool[Array, "c"]
+
+
+_MUTUAL_BONUS = 0.05
+"""Of the margin, for being each other's best match (cosines are in [-1, 1])."""
+
+
+def select_candidates(
+    similarity: Float[Array, "n m"],
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+    *,
+    matches: int,
+    keep: int,
+) -> Candidates:
+    """The `keep` clearest of the best `matches` of every row and of every column.
+
+    A match is clear by its margin: how far its similarity lies above the best one that is *not*
+    among the `matches` of its row (column), plus a bonus if it is mutually the best. A match that
+    stands in both lists counts once. With fewer than `keep`, the rest is masked out.
+
+    Raises:
+      ValueError: not ``1 <= matches < min(n, m)``.
+    """
+    n, m = similarity.shape
+    if not 1 <= matches < min(n, m):
+        raise ValueError(
+            f"matches = {matches} of every point need clouds of more points, got {n} and {m}: "
+            "choose 1 <= matches < min(n, m)."
+        )
+    keep = min(keep, (n + m) * matches)
+    valid = jnp.ones((n, m), bool)
+    if source_mask is not None:
+        valid = valid & source_mask[:, None]
+    if reference_mask is not None:
+        valid = valid & reference_mask[None, :]
+    similarity = jnp.where(valid, similarity, -2)
+    by_row, column = _best(similarity, matches)
+    by_column, row = _best(similarity.T, matches)
+    source = jnp.concatenate([jnp.repeat(jnp.arange(n), matches), row.reshape(-1)])
+    reference = jnp.concatenate([column.reshape(-1), jnp.repeat(jnp.arange(m), matches)])
+    value = similarity[source, reference]
+    margins = [(best[:, :-1] - best[:, -1:]).reshape(-1) for best in (by_row, by_column)]
+    mutual = (value >= by_row[source, 0]) & (value >= by_column[reference, 0])
+    clarity = jnp.concatenate(margins) + _MUTUAL_BONUS * mutual
+    listed = (jnp.arange(value.shape[0]) >= n * matches) & (value >= by_row[source, matches - 1])
+    clarity = jnp.where(listed | (value <= -2), -jnp.inf, clarity)
+    clarity, chosen = jax.lax.top_k(clarity, keep)
+    return Candidates(
+        source[chosen].astype(jnp.int32),
+        reference[chosen].astype(jnp.int32),
+        jnp.isfinite(clarity),
+    )
+
+
+def _best(similarity: Array, matches: int) -> tuple[Array, Array]:
+    """Values of the best ``matches + 1`` of every row, and the columns of the best `matches`."""
+    # The barrier keeps XLA from turning the selection into a full sort when it is sliced.
+    values, index = jax.lax.optimization_barrier(jax.lax.top_k(similarity, matches + 1))
+    return values, index[:, :matches]

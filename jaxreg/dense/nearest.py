@@ -1,0 +1,69 @@
+"""Nearest points fast enough for thousands of poses: a packed minimum, and a grid of answers."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg.neighbors import squared_distances
+
+_FAR = 1e4
+"""Where padding is put, in units of the clouds."""
+
+
+class NearestGrid(NamedTuple):
+    """The nearest point of a cloud to the centre of every cell of a box around it."""
+
+    index: Int[Array, "cells"]
+    corner: Float[Array, "3"]
+    cell: Float[Array, "3"]
+
+
+def nearest_packed(
+    queries: Float[Array, "q 3"], points: Float[Array, "m 3"], mask: Bool[Array, "m"]
+) -> Int[Array, "q"]:
+    """Index of the nearest valid point of every query, right but for near-equal distances.
+
+    The index replaces the last ``log2(m)`` bits of the squared distance, which then orders as
+    before: one vectorised minimum instead of an argmin, ten times faster on a CPU. With 1024 points
+    in float32, squared distances that differ by less than 1/8000 count as equal.
+    """
+    points = jax.lax.stop_gradient(jnp.where(mask[:, None], points, _FAR))
+    squared = squared_distances(jax.lax.stop_gradient(queries), points)
+    integer = jnp.int32 if squared.dtype == jnp.float32 else jnp.int64
+    low = (1 << max(points.shape[0] - 1, 1).bit_length()) - 1
+    # Not zero: a denormal would be flushed to zero and lose its index.
+    tiny = jnp.asarray(1e-12, squared.dtype)
+    bits = jax.lax.bitcast_convert_type(squared + tiny, integer) & ~integer(low)
+    packed = bits | jnp.arange(points.shape[0], dtype=integer)[None, :]
+    best = jnp.min(jax.lax.bitcast_convert_type(packed, squared.dtype), axis=1)
+    found = jax.lax.bitcast_convert_type(best, integer) & integer(low)
+    return jnp.minimum(found, points.shape[0] - 1).astype(jnp.int32)
+
+
+def nearest_grid(
+    points: Float[Array, "m 3"], mask: Bool[Array, "m"], *, cells: int, margin: float
+) -> NearestGrid:
+    """`cells` cells along each axis of the bounding box, widened by `margin` on every side."""
+    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0) - margin
+    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0) + margin
+    low, high = (jnp.where(jnp.any(mask), side, 0) for side in (low, high))
+    cell = jnp.maximum((high - low) / cells, 1e-6)
+    steps = jnp.arange(cells, dtype=points.dtype) + 0.5
+    axes = [low[k] + cell[k] * steps for k in range(3)]
+    centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1)
+    index = jax.lax.map(
+        lambda rows: nearest_packed(rows, points, mask), centres.reshape(cells, -1, 3)
+    )
+    return NearestGrid(index.reshape(-1), low, cell)
+
+
+def lookup(grid: NearestGrid, queries: Float[Array, "*q 3"]) -> Int[Array, "*q"]:
+    """About the nearest point: the one nearest to the centre of the query's cell.
+
+    A query outside the box takes the nearest cell of the box.
+    """
+    cells = round(grid.index.shape[0] ** (1 / 3))
+    cell = jnp.clip(((queries - grid.corner) / grid.cell).astype(jnp.int32), 0, cells - 1)
+    return grid.index[(cell[..., 0] * cells + cell[..., 1]) * cells + cell[..., 2]]

@@ -1,0 +1,188 @@
+"""The dense path from two clouds to a pose; jit, vmap and grad it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg import rigid
+from jaxreg.config import DenseConfig
+from jaxreg.dense.alignment import align_coarse, align_fine
+from jaxreg.dense.candidates import select_candidates
+from jaxreg.dense.compatibility import compatibility
+from jaxreg.dense.hypotheses import best_of, pick_distinct, pose_hypotheses, screen
+from jaxreg.dense.moments import moment_descriptors, openness, standardized
+from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
+from jaxreg.dense.surface import Surface, thinned
+from jaxreg.dense.verification import evidence, plausibility
+from jaxreg.refine import frame
+from jaxreg.types import Registration, RigidTransform
+
+_DEFAULT = DenseConfig()
+_RMS_OF_UNIT_SPHERE = 0.5
+"""Root mean square radius of a usual shape that touches the unit sphere (ModelNet40: 0.4 to 0.6)."""
+
+
+class Search(NamedTuple):
+    """The distinct refined poses (leading axis), best first, in the original frame, and scores."""
+
+    poses: RigidTransform
+    score: Float[Array, "s"]
+
+
+def register_dense(
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    *,
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+    config: DenseConfig = _DEFAULT,
+) -> Registration:
+    """The pose of the source in the frame of the reference, from any start and without learning.
+
+    `correspondences[i]` is the reference point nearest to source point i under the pose;
+    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w the last fine width. The pose
+    is differentiable in both clouds through the last refinement alone: the search is discrete.
+
+    Raises:
+      ValueError: a cloud is not (n, 3), or has fewer points than `config.matches` + 1.
+    """
+    where, x, y = _enter(source, reference, source_mask, reference_mask, config)
+    found = _search(x, y, source_mask, reference_mask, config)
+    start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
+    a, b = _surface(x, source_mask, config)[0], _surface(y, reference_mask, config)[0]
+    pose = align_fine(start, a, b, config.final_widths, thickness=config.thickness)
+    return _registration(where, pose, a, b, config)
+
+
+def search_dense(
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    *,
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+    config: DenseConfig = _DEFAULT,
+) -> Search:
+    """The finalists of the search before the last refinement; errors as `register_dense`."""
+    where, x, y = _enter(source, reference, source_mask, reference_mask, config)
+    found = _search(x, y, source_mask, reference_mask, config)
+    return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
+
+
+def _enter(source, reference, source_mask, reference_mask, config: DenseConfig):
+    """Both clouds centred, in units of which a usual shape fills the unit sphere."""
+    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
+    factor = _RMS_OF_UNIT_SPHERE if config.unit == 0 else where.length / config.unit
+    where = where._replace(length=where.length / factor)
+    return where, x * factor, y * factor
+
+
+def _surface(points: Array, mask: Array | None, config: DenseConfig):
+    """The cloud with its normals and rim, and its features."""
+    valid = jnp.ones(points.shape[0], bool) if mask is None else mask
+    described = moment_descriptors(
+        points, valid, radii=config.radii, normal_radius=config.normal_radius
+    )
+    rim = openness(points, described.normals, valid, radius=config.rim_radius)
+    return Surface(points, described.normals, rim, valid), described.features
+
+
+def _search(x, y, source_mask, reference_mask, config: DenseConfig) -> Search:
+    x, y = jax.lax.stop_gradient((x, y))
+    source, features = _surface(x, source_mask, config)
+    reference, others = _surface(y, reference_mask, config)
+    features, others = standardized(features, others, source.mask, reference.mask)
+    poses = _hypotheses(source, reference, features @ others.T, config)
+    grids = [
+        nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
+        for s in (reference, source)
+    ]
+    poses = _screened(poses, source, reference, grids, config)
+    coarse = lambda pose: align_coarse(  # noqa: E731
+        pose,
+        thinned(source, config.coarse_step),
+        reference,
+        grids[0],
+        config.coarse_widths,
+        thickness=config.coarse_thickness,
+    )
+    poses = jax.vmap(coarse)(poses)
+    poses, _ = _ranked(poses, source, reference, config, config.finalists)
+    fine = lambda pose: align_fine(  # noqa: E731
+        pose, source, reference, config.fine_widths, thickness=config.thickness
+    )
+    poses = jax.lax.map(fine, poses)
+    return Search(*_ranked(poses, source, reference, config, config.finalists))
+
+
+def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: DenseConfig):
+    candidates = select_candidates(
+        similarity,
+        source.mask,
+        reference.mask,
+        matches=config.matches,
+        keep=config.candidates,
+    )
+    i, j = candidates.source_index, candidates.reference_index
+    first = compatibility(
+        source.points[i],
+        reference.points[j],
+        source.normals[i],
+        reference.normals[j],
+        candidates.mask,
+        tolerance=config.tolerance,
+        normal_tolerance=config.normal_tolerance,
+    )
+    return pose_hypotheses(
+        source.points[i], reference.points[j], first, partners=min(config.partners, len(i) - 1)
+    )
+
+
+def _screened(
+    poses, source: Surface, reference: Surface, grids: list[NearestGrid], config: DenseConfig
+):
+    """The distinct best hypotheses by their overlap in both directions."""
+    a, b = thinned(source, config.coarse_step), thinned(reference, config.coarse_step)
+    backward = jax.vmap(rigid.inverse)(poses)
+    score = screen(poses, a, reference, grids[0], width=config.screen_width)
+    score = score + screen(backward, b, source, grids[1], width=config.screen_width)
+    chosen = pick_distinct(
+        poses,
+        score,
+        count=min(config.screened, len(score)),
+        angle=config.distinct_angle,
+        distance=config.distinct_distance,
+    )
+    return best_of(poses, chosen)
+
+
+def _ranked(poses, source: Surface, reference: Surface, config: DenseConfig, count: int):
+    """The `count` most plausible poses, best first, and their plausibility."""
+    found = jax.lax.map(
+        lambda pose: evidence(
+            pose,
+            source,
+            reference,
+            width=config.match_width,
+            plane_width=config.plane_width,
+            rim=config.rim,
+        ),
+        poses,
+    )
+    score = plausibility(found, contradiction=config.contradiction, beside=config.beside)
+    score, order = jax.lax.top_k(score, min(count, len(score)))
+    return best_of(poses, order), score
+
+
+def _registration(where, pose, a: Surface, b: Surface, config: DenseConfig) -> Registration:
+    valid = jnp.any(a.mask) & jnp.any(b.mask)
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(a.points.dtype))
+    moved = rigid.apply(pose, a.points)
+    nearest = nearest_packed(moved, b.points, b.mask)
+    squared = jnp.sum((moved - b.points[nearest]) ** 2, axis=-1)
+    trust = jnp.exp(-squared / (2 * config.final_widths[-1] ** 2)) * (a.mask & valid)
+    pose = frame.transform_out(where, pose)
+    correspondences = b.points[nearest] * where.length + where.reference_centre
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(a.points.dtype))
+    return Registration(*pose, rigid.to_matrix(pose), trust, correspondences, valid)

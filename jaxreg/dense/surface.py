@@ -1,0 +1,22 @@
+"""A cloud as this room uses it: points, normals, how open the surface is there, and the mask."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+
+class Surface(NamedTuple):
+    """Points of a surface with unit normals of arbitrary sign; rows with `mask` False are padding.
+
+    `openness` is near 0 inside the sampled surface and large on its rim.
+    """
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    openness: Float[Array, "n"]
+    mask: Bool[Array, "n"]
+
+
+def thinned(surface: Surface, step: int) -> Surface:
+    """Every `step`-th point."""
+    return Surface(*(field[::step] for field in surface))
