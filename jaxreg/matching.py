@@ -79,22 +79,33 @@ def neighborhood_sum(
     return jax.lax.custom_linear_solve(
         lambda x: x,
         scores,
-        solve=lambda _, x: _gather_rows(_gather_rows(x, source).T, reference).T,
-        transpose_solve=lambda _, x: _collect_rows(_collect_rows(x, source).T, reference).T,
+        solve=lambda _, x: _two_passes(_gather, x, source, reference),
+        transpose_solve=lambda _, x: _two_passes(_collect, x, source, reference),
     )
 
 
-def _gather_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+def _two_passes(one_pass, x: Float[Array, "n m"], source: Incidence, reference: Incidence):
+    return one_pass(one_pass(x, source).T, reference).T
+
+
+def _gather(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     """``A x``: sum of the rows of the neighbours."""
-    return sum(x[graph.idx[:, r]] for r in range(graph.idx.shape[1]))
+
+    # A loop, since XLA fuses nothing across its border: written out, whatever makes `x` would be
+    # computed anew in each of the gathers, at strided addresses.
+    def add(r, total):
+        return total + x.at[graph.idx[:, r]].get(mode="promise_in_bounds")
+
+    return jax.lax.fori_loop(0, graph.idx.shape[1], add, jnp.zeros_like(x))
 
 
-def _collect_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+def _collect(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     """``A^T x``: sum of the rows of those that have this point as a neighbour."""
 
     def add(r, total):
-        rows = graph.member[jnp.minimum(graph.start + r, graph.member.shape[0] - 1)]
-        return total + jnp.where((r < graph.count)[:, None], x[rows], 0)
+        member = graph.member[jnp.minimum(graph.start + r, graph.member.shape[0] - 1)]
+        rows = x.at[member].get(mode="promise_in_bounds")
+        return total + jnp.where((r < graph.count)[:, None], rows, 0)
 
     return jax.lax.fori_loop(0, jnp.max(graph.count), add, jnp.zeros_like(x))
 

@@ -206,7 +206,9 @@ def iterate(
         features, variables = _both_features(
             variables, points, source_graph, source.mask, config, train
         )
-        matches = _match(
+        # The maps are computed again in the backward pass: cheaper than writing out and reading
+        # back a dozen (n, m) arrays a step, and a third of the memory.
+        matches = jax.checkpoint(_match, static_argnums=5)(
             features, reference_features, source_graph, reference_graph, reference, config
         )
         structures = [_structure(x, source_graph.neighbors, config) for x in (points, matches.copy)]

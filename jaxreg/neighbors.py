@@ -80,7 +80,11 @@ def nearest_in(
     distance = jax.lax.stop_gradient(squared_distances(points, without_padding(others, mask)))
     if mask is not None:
         distance = jnp.where(mask[None, :], distance, jnp.inf)
-    return jnp.argmin(distance, axis=1).astype(jnp.int32)
+    # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
+    # argmin, which carries both through one reduction, element by element.
+    smallest = jnp.min(distance, axis=1, keepdims=True)
+    column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
+    return jnp.min(jnp.where(distance <= smallest, column, others.shape[0] - 1), axis=1)
 
 
 def _check_points(points: Array) -> None:
