@@ -1,38 +1,43 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
-import functools
 import time
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from jaxreg import compilation, scans, search
-from jaxreg.refine.gicp import gicp
-from jaxreg.refine.icp import icp
-from jaxreg.refine.point_to_plane import point_to_plane
+from jaxreg import scans
+from jaxreg.config import RegisterConfig
+from jaxreg.refine.host import Refined
+from jaxreg.refine.host import refine as refine_pose
+from jaxreg.refine.uncertainty import weak_directions
+from jaxreg.search import host, verdict
 from jaxreg.types import RigidTransform
 
 Rotation = Literal["limited", "full"]
 Refinement = Literal["gicp", "icp", "point_to_plane"]
 
-_SMALLEST, _LARGEST = 64, 2048
-_SEARCHED = 256
+_DEFAULT = RegisterConfig()
+_FEWEST_FOR_FEATURES = 32
+_FEWEST_FOR_NORMALS = 11
 
 
 class ScanRegistration(NamedTuple):
     """Where the source lies in the frame of the reference, and how far that can be trusted.
 
-    float64, in the unit of the input; a row for every row of the source. `confidence[i]`, in [0, 1],
-    says how well point `i` agrees with the reference after alignment, and `correspondences[i]` is
-    the reference point nearest to it there (NaN for a dropped point). `fitness` is the share of the
-    source within reach of the reference, `inlier_rmse` the root mean square distance of those,
-    `overlap` the share of both clouds within reach of the other. `covariance` is that of a rotation
-    vector (rad) and a translation about the reference's centroid. `weak_directions` names motions that
-    the clouds do not resist. `success` is False when the pose should not be trusted; `probability`
-    is the calibrated chance that it is right. `dropped` counts the non-finite rows of both clouds.
+    float64, in the unit of the input, a row for every row of the source. `confidence[i]`, in
+    [0, 1], says how well point `i` agrees with the reference after alignment; `correspondences[i]`
+    is the reference point nearest to it there (NaN for a dropped point). `reach` is the distance
+    within which two points count as the same surface, taken from their spacing. `fitness` is the
+    share of the source within reach of the reference, `inlier_rmse` the root mean square distance
+    of those points, `overlap` the share of both clouds within reach of the other, at equal density.
+
+    `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
+    reference. `weak_directions` names the motions that the clouds hardly resist. `success` is False
+    when the pose should not be trusted, `probability` is the calibrated chance that it is right.
+    `dropped` counts the non-finite rows of both clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -40,6 +45,7 @@ class ScanRegistration(NamedTuple):
     transformation: Float[np.ndarray, "4 4"]
     confidence: Float[np.ndarray, "n"]
     correspondences: Float[np.ndarray, "n 3"]
+    reach: float
     fitness: float
     inlier_rmse: float
     overlap: float
@@ -56,17 +62,18 @@ def register(
     reference: object,
     *,
     initial: object = None,
-    rotation: Rotation = "limited",
+    rotation: Rotation = "full",
     refine: Refinement | None = "gicp",
     nonfinite: Literal["raise", "drop"] = "raise",
-    seed: int = 0,
+    config: RegisterConfig = _DEFAULT,
 ) -> ScanRegistration:
     """The rigid transform ``y = R x + t`` that lays `source` on `reference`, with a verdict.
 
-    Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit. `initial` (4x4 or a
-    `RigidTransform`) starts from a known pose and skips the search. `rotation` says how far apart the
-    clouds may be turned: "limited" to about 75 degrees, or "full". Deterministic; the order of the
-    points plays no role.
+    Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit; neither their sizes nor
+    their order nor their origin play a role. `initial` (4x4 or a `RigidTransform`) starts from a
+    known pose and skips the search. `rotation` says how far the clouds may be turned: "full" by
+    anything, "limited" by `config.limited_deg`, which settles symmetric shapes. `refine` None gives
+    the pose of the search. The same input gives the same bits.
 
     Raises:
       ValueError: a cloud is not numeric (n, 3) with three finite points or more (the message names
@@ -80,10 +87,15 @@ def register(
     frame = scans.common_frame(moving.points, fixed.points)
     x = (moving.points - frame.source_centre) / frame.length
     y = (fixed.points - frame.reference_centre) / frame.length
-    x, y = (scans.reduce_to(points, _LARGEST) for points in (x, y))
-    pose = _search(x, y, rotation) if start is None else _into(frame, start)
-    pose = _refined(x, y, pose, refine)
-    return _result(source, reference, moving, fixed, _out_of(frame, pose), frame, begin)
+    clouds = *host.coarse_pair(x, y, config), frame
+    if start is None:
+        pose = _searched(*clouds, rotation, config)
+    else:
+        start = RigidTransform(*(part[None] for part in scans.pose_in(frame, start)))
+        pose = _first(host.polished(start, *clouds[:3])) if refine else _first(start)
+    refined = _refined(x, y, pose, refine, clouds[2], config)
+    judged = verdict.evidence(refined.transform, *clouds[:2], config.reach * clouds[2])
+    return _result(x, y, moving, fixed, frame, refined, judged, config.reach * clouds[2], begin)
 
 
 def _check_options(rotation: str, refine: str | None) -> None:
@@ -101,131 +113,109 @@ def _check_initial(initial: object) -> RigidTransform:
         if matrix.shape != (4, 4):
             raise ValueError(f"initial must be a 4x4 matrix [[R, t], [0, 1]], got {matrix.shape}.")
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
-    if not finite or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise ValueError("initial is no rigid transform: R must be orthogonal and all be finite.")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("initial mirrors (det R = -1): give a rotation.")
-    return RigidTransform(_orthogonal(rotation), translation)
-
-
-def _orthogonal(rotation: np.ndarray) -> np.ndarray:
-    """The nearest rotation, in float64."""
-    u, _, vt = np.linalg.svd(np.asarray(rotation, np.float64))
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def _into(frame: scans.Frame, pose: RigidTransform) -> RigidTransform:
-    shift = pose.rotation @ frame.source_centre + pose.translation - frame.reference_centre
-    return RigidTransform(pose.rotation, shift / frame.length)
-
-
-def _out_of(frame: scans.Frame, pose: RigidTransform) -> RigidTransform:
-    rotation = _orthogonal(pose.rotation)
-    shift = np.asarray(pose.translation, np.float64) * frame.length
-    return RigidTransform(rotation, frame.reference_centre - rotation @ frame.source_centre + shift)
-
-
-def _pad(points: np.ndarray):
-    return scans.padded(points, scans.bucket(len(points), smallest=_SMALLEST, largest=_LARGEST))
-
-
-@functools.cache
-def _compiled_search():
-    return compilation.jit(
-        search.multi_start, static_argnames=("limit", "kept", "iterations", "trim")
-    )
-
-
-@functools.cache
-def _compiled_refinement(name: str):
-    method = {"gicp": gicp, "icp": icp, "point_to_plane": point_to_plane}[name]
-
-    def run(x, y, pose, x_mask, y_mask):
-        return method(
-            x,
-            y,
-            initial=pose,
-            source_mask=x_mask,
-            reference_mask=y_mask,
-            kernel="cauchy",
-            anneal=4.0,
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        raise ValueError("initial holds NaN or infinity: give a finite transform.")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            "initial is no rigid transform (its 3x3 part must be a rotation: orthogonal, det +1): "
+            "remove scale, shear and mirroring."
         )
+    return RigidTransform(scans.nearest_rotation(rotation), translation)
 
-    return compilation.jit(run)
+
+def _searched(
+    source: host.Coarse,
+    reference: host.Coarse,
+    spacing: float,
+    frame: scans.Frame,
+    rotation: Rotation,
+    config: RegisterConfig,
+) -> RigidTransform:
+    """The pose on which the coarse clouds agree best, of features, and of a covering if they fail."""
+    largest = 180.0 if rotation == "full" else config.limited_deg
+    unmoved = scans.pose_in(frame, RigidTransform(np.eye(3), np.zeros(3)))
+    pool = RigidTransform(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), unmoved.translation]))
+    enough = min(len(source.valid), len(reference.valid)) >= _FEWEST_FOR_FEATURES
+    if enough:
+        pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
+        pose, score = _best(pool, source, reference, spacing, largest, config)
+        if score < config.doubtful:
+            return pose
+    pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
+    return _best(pool, source, reference, spacing, largest, config)[0]
 
 
-def _search(x: np.ndarray, y: np.ndarray, rotation: Rotation) -> RigidTransform:
-    rotations = search.rotation_covering(
-        *((576,) if rotation == "full" else (1024,)),
-        largest_deg=180.0 if rotation == "full" else 80.0,
-    )
-    x, y = (scans.reduce_to(points, _SEARCHED) for points in (x, y))
-    (x, x_mask), (y, y_mask) = _pad(x), _pad(y)
-    poses, _ = _compiled_search()(
+def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidTransform, float]:
+    """The pose of a pool that agrees best after polishing, and its disagreement."""
+    reach = config.reach * spacing
+    pool = host.turned_less(pool, largest_deg)
+    scores = host.disagreement(pool, source, reference, 2 * reach)
+    chosen = host.distinct_best(pool, scores, config.verified, apart=2 * spacing)
+    chosen = host.polished(chosen, source, reference, spacing)
+    scores = host.disagreement(chosen, source, reference, reach)
+    # Of poses that agree equally (a symmetric shape) the one that turns least.
+    best = int(np.argmin(scores + 0.01 * host.angles(chosen) / np.pi))
+    return jax.tree.map(lambda part: part[best], chosen), float(scores[best])
+
+
+def _first(poses: RigidTransform) -> RigidTransform:
+    return jax.tree.map(lambda part: part[0], poses)
+
+
+def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> Refined:
+    """The pose refined with more points than the search had."""
+    x, y = (scans.reduce_to(points, config.refine_points) for points in (x, y))
+    finer = min(spacing, max(scans.spacing(x), scans.spacing(y)))
+    few = min(len(x), len(y)) < _FEWEST_FOR_NORMALS
+    if few:
+        x, y = (np.resize(points, (_FEWEST_FOR_NORMALS, 3)) for points in (x, y))
+    return refine_pose(
         x,
         y,
-        rotations.astype(np.float32),
-        x_mask,
-        y_mask,
-        limit=0.25,
-        kept=32,
-        iterations=10,
-        trim=0.8,
+        method="icp" if few else method or "icp",
+        initial=pose,
+        iterations=config.refine_iterations if method else 1,
+        max_distance=3 * finer if method else 0.0,
+        scale=0.5 * finer,
+        anneal=4.0,
+        dense_limit=0,
     )
-    return jax.tree.map(lambda a: np.asarray(a[0], np.float64), poses)
 
 
-def _refined(x, y, pose: RigidTransform, refine: Refinement | None) -> RigidTransform:
-    if refine is None:
-        return pose
-    (x, x_mask), (y, y_mask) = _pad(x), _pad(y)
-    pose = RigidTransform(*(np.asarray(part, np.float32) for part in pose))
-    pose = _compiled_refinement(refine)(x, y, pose, x_mask, y_mask)
-    return jax.tree.map(lambda a: np.asarray(a, np.float64), pose)
-
-
-def _result(source, reference, moving, fixed, pose, frame, begin) -> ScanRegistration:
-    points = np.asarray(source, np.float64)
-    centred = (points[moving.kept] - frame.source_centre) / frame.length
-    y = (fixed.points - frame.reference_centre) / frame.length
-    inner = _into(frame, pose)
-    aligned = centred @ inner.rotation.T + inner.translation
-    distance, index = scans.nearest(cKDTree(y), aligned)
-    back, _ = scans.nearest(cKDTree(aligned), y)
-    spacing = _spacing(y)
-    reach = 2.5 * spacing
+def _result(
+    x: np.ndarray,
+    y: np.ndarray,
+    moving: scans.Scan,
+    fixed: scans.Scan,
+    frame: scans.Frame,
+    refined: Refined,
+    judged: verdict.Evidence,
+    reach: float,
+    begin: float,
+) -> ScanRegistration:
+    inner = RigidTransform(scans.nearest_rotation(refined.transform.rotation), refined.transform[1])
+    pose = scans.pose_out(frame, inner)
+    distance, index = scans.nearest(cKDTree(y), x @ inner.rotation.T + inner.translation)
     near = distance <= reach
-    confidence = np.zeros(len(points))
-    confidence[moving.kept] = np.exp(-0.5 * (distance / (0.5 * reach)) ** 2)
-    matches = np.full(points.shape, np.nan)
-    matches[moving.kept] = fixed.points[index]
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose
-    fitness = float(near.mean())
-    overlap = float((near.sum() + (back <= reach).sum()) / (len(near) + len(back)))
-    rmse = float(np.sqrt(np.mean(distance[near] ** 2)) * frame.length) if near.any() else 0.0
-    dropped = int(np.sum(~moving.kept) + np.sum(~fixed.kept))
+    confidence = np.maximum(0, 1 - (distance / reach) ** 2) ** 2
+    units = np.repeat([1.0, frame.length], 3)
+    chance = verdict.probability(judged)
     return ScanRegistration(
         rotation=pose.rotation,
         translation=pose.translation,
-        transformation=matrix,
-        confidence=confidence,
-        correspondences=matches,
-        fitness=fitness,
-        inlier_rmse=rmse,
-        overlap=overlap,
-        covariance=np.zeros((6, 6)),
-        weak_directions=(),
-        success=bool(overlap > 0.5),
-        probability=overlap,
+        transformation=np.block([[pose.rotation, pose.translation[:, None]], [0, 0, 0, 1]]),
+        confidence=scans.per_input_row(moving, confidence, missing=0.0),
+        correspondences=scans.per_input_row(moving, fixed.points[index], missing=np.nan),
+        reach=reach * frame.length,
+        fitness=float(np.mean(near[moving.row])),
+        inlier_rmse=float(np.sqrt(np.mean(distance[near] ** 2)) * frame.length)
+        if near.any()
+        else 0,
+        overlap=judged.overlap,
+        covariance=refined.uncertainty.covariance * np.outer(units, units),
+        weak_directions=tuple(d.name for d in weak_directions(refined.uncertainty)),
+        success=chance >= verdict.TRUSTED,
+        probability=chance,
         seconds=time.perf_counter() - begin,
-        dropped=dropped,
+        dropped=int(np.sum(~moving.kept) + np.sum(~fixed.kept)),
     )
-
-
-def _spacing(points: np.ndarray) -> float:
-    """Median distance of a point to its nearest other one."""
-    if len(points) < 2:
-        return 1e-6
-    return float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))

@@ -10,8 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
+from jaxreg.types import RigidTransform
+
 _LARGEST = 1e100
 """Coordinates beyond would overflow when squared."""
+_FINEST = 1e-6
 _FEWEST = 3
 """Two points leave a rotation about the line between them."""
 
@@ -20,11 +23,13 @@ class Scan(NamedTuple):
     """A checked cloud in canonical order.
 
     `points` are the distinct finite points in lexicographic order, so that neither the order nor the
-    repetition of the input's rows can change a result. `kept` says which input rows are finite.
+    repetition of the input's rows can change a result. `kept` says which input rows are finite, and
+    ``points[row]`` are the kept rows in their own order.
     """
 
     points: Float[np.ndarray, "p 3"]
     kept: Bool[np.ndarray, "n"]
+    row: Int[np.ndarray, "k"]
 
 
 class Frame(NamedTuple):
@@ -88,15 +93,30 @@ def _as_floats(points: object, name: str) -> np.ndarray:
 def make_scan(points: object, name: str, *, nonfinite: Literal["raise", "drop"] = "raise") -> Scan:
     """The canonical form of a cloud; errors as `check_points`."""
     array, finite = check_points(points, name, nonfinite=nonfinite)
-    return Scan(_distinct(array[finite]), finite)
+    points, row = _distinct(array[finite])
+    return Scan(points, finite, row)
 
 
-def _distinct(points: np.ndarray) -> np.ndarray:
-    """The distinct rows in lexicographic order (numpy.unique on rows is several times slower)."""
-    ordered = points[np.lexsort(points.T[::-1])] + 0.0  # -0.0 and 0.0 are one number.
+def _distinct(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows in lexicographic order (numpy.unique on rows is several times slower).
+
+    Also which of them every given row is.
+    """
+    points = points + 0.0  # -0.0 and 0.0 are one number.
+    order = np.lexsort(points.T[::-1])
+    ordered = points[order]
     new = np.ones(len(ordered), bool)
     new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    return ordered[new]
+    row = np.empty(len(points), np.int64)
+    row[order] = np.cumsum(new) - 1
+    return ordered[new], row
+
+
+def per_input_row(scan: Scan, values: np.ndarray, *, missing: float) -> np.ndarray:
+    """Values of the scan's points as rows of the input, `missing` where a row was dropped."""
+    rows = np.full((len(scan.kept), *values.shape[1:]), missing)
+    rows[scan.kept] = values[scan.row]
+    return rows
 
 
 def common_frame(source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"]) -> Frame:
@@ -110,6 +130,24 @@ def common_frame(source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, 
     # Below this the spread is the rounding of the offset, and no shape.
     noise = 16 * np.finfo(np.float64).eps * max(np.abs(source).max(), np.abs(reference).max())
     return Frame(*centres, length if length > noise else 1.0)
+
+
+def pose_in(frame: Frame, pose: RigidTransform) -> RigidTransform:
+    """A pose of the original clouds as one of the scaled clouds."""
+    shift = pose.rotation @ frame.source_centre + pose.translation - frame.reference_centre
+    return RigidTransform(pose.rotation, shift / frame.length)
+
+
+def pose_out(frame: Frame, pose: RigidTransform) -> RigidTransform:
+    """The inverse of `pose_in`."""
+    shift = pose.translation * frame.length + frame.reference_centre
+    return RigidTransform(pose.rotation, shift - pose.rotation @ frame.source_centre)
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation nearest to a matrix, orthogonal to float64."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
+    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _mean(points: np.ndarray) -> np.ndarray:
@@ -182,3 +220,16 @@ def nearest(
     """Distance to, and index of, the nearest point of the tree, on all cores."""
     distance, index = tree.query(points, workers=-1)
     return np.asarray(distance), np.asarray(index)
+
+
+def spacing(points: Float[np.ndarray, "n 3"]) -> float:
+    """How far apart neighbouring points of the surface are: the median distance to the 4th nearest.
+
+    On a surface covered by squares of edge a, one point each, this is about a. At least 1e-6, the
+    resolution of float32 in a cloud of radius 1.
+    """
+    k = min(4, len(points) - 1)
+    if k < 1:
+        return _FINEST
+    distance = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, -1]
+    return max(float(np.median(distance)), _FINEST)

@@ -1,0 +1,86 @@
+"""Clouds from and to files: one function each way, the format chosen by the suffix."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxreg.io import arrays, las, mesh, pcd, ply, text
+
+__all__ = ["READABLE", "WRITABLE", "read_cloud", "write_cloud"]
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".ply": ply.read,
+    ".pcd": pcd.read,
+    ".xyz": text.read,
+    ".txt": text.read,
+    ".csv": text.read,
+    ".npy": arrays.read,
+    ".npz": arrays.read,
+    ".obj": mesh.read,
+    ".off": mesh.read,
+    ".stl": mesh.read,
+    ".las": las.read,
+    ".laz": las.read,
+}
+_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
+    ".ply": ply.write,
+    ".pcd": pcd.write,
+    ".xyz": text.write,
+    ".txt": text.write,
+    ".csv": text.write,
+    ".npy": arrays.write,
+    ".npz": arrays.write,
+    ".las": las.write,
+    ".laz": las.write,
+}
+READABLE, WRITABLE = tuple(_READERS), tuple(_WRITERS)
+
+
+def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
+    """The points of a file, float64, in its own unit and order; meshes are sampled by area.
+
+    Points that are NaN stay in place: they are for the caller to refuse or to drop. Nothing is ever
+    unpickled.
+
+    Raises:
+      ValueError: there is no such file, its suffix is unknown, it is malformed or truncated, or it
+        holds no point; the message names the file, the row where there is one, and the remedy.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _READERS:
+        raise ValueError(
+            f"{path}: the suffix '{path.suffix}' is no format known here: convert the file to one "
+            f"of {', '.join(READABLE)}."
+        )
+    if not path.is_file():
+        raise ValueError(f"{path}: there is no such file: correct the path.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} is empty (0 bytes): write it again.")
+    points = _READERS[path.suffix.lower()](path)
+    if len(points) == 0:
+        raise ValueError(f"{path} holds no point: write it again, or choose another file.")
+    return points
+
+
+def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
+    """Write points in the format of the suffix; float64 wherever the format allows it.
+
+    Raises:
+      ValueError: the suffix is not writable, or the folder does not exist.
+    """
+    path = Path(path)
+    check_writable(path)
+    _WRITERS[path.suffix.lower()](path, np.asarray(points, np.float64))
+
+
+def check_writable(path: Path) -> None:
+    """Raises ValueError unless `write_cloud` could write there."""
+    if path.suffix.lower() not in _WRITERS:
+        raise ValueError(
+            f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
+            f"{', '.join(WRITABLE)}."
+        )
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")

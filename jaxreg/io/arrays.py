@@ -1,0 +1,56 @@
+"""NumPy's own files: NPY with an array (n, 3), NPZ with such an array in it. Never unpickled."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+
+def read(path: Path) -> np.ndarray:
+    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`.
+
+    More columns than three (colours, intensity) are not read. In an NPZ file the array is `points`,
+    or the only one that could be a cloud.
+    """
+    try:
+        content = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
+        raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
+    if isinstance(content, np.ndarray):
+        return _points(content, str(path))
+    with content:
+        try:
+            return _chosen({name: content[name] for name in content.files}, path)
+        except (zipfile.BadZipFile, EOFError, OSError) as error:
+            raise ValueError(f"{path} is damaged ({error}): save it again.") from None
+
+
+def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:
+    if "points" in named:
+        return _points(named["points"], f"{path}['points']")
+    clouds = [name for name, array in named.items() if array.ndim == 2 and array.shape[1] >= 3]
+    if len(clouds) != 1:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in named.items())
+        raise ValueError(
+            f"{path} holds {shapes or 'nothing'}: save the cloud (n, 3) under the name 'points'."
+        )
+    return _points(named[clouds[0]], f"{path}['{clouds[0]}']")
+
+
+def _points(array: np.ndarray, where: str) -> np.ndarray:
+    if array.dtype.names and set("xyz") <= set(array.dtype.names):
+        array = np.stack([array[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] < 3:
+        raise ValueError(
+            f"{where} is {array.dtype} {array.shape}, not numbers (n, 3): save one point a row."
+        )
+    return array[:, :3].astype(np.float64)
+
+
+def write(path: Path, points: np.ndarray) -> None:
+    """The array itself, or an archive with the array `points`."""
+    if path.suffix.lower() == ".npz":
+        np.savez_compressed(path, points=points)
+    else:
+        np.save(path, points)

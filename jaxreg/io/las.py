@@ -1,0 +1,38 @@
+"""LAS and LAZ, the files of airborne and terrestrial laser scanners, by laspy (extra `las`)."""
+
+from pathlib import Path
+
+import numpy as np
+
+
+def read(path: Path) -> np.ndarray:
+    """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
+    laspy = _laspy(path)
+    try:
+        return np.asarray(laspy.read(path).xyz, np.float64)
+    except Exception as error:  # noqa: BLE001 - laspy and its backends raise types of their own
+        raise ValueError(
+            f"{path} cannot be read as {path.suffix} ({type(error).__name__}: {error}): "
+            "it is malformed or truncated; export it again."
+        ) from None
+
+
+def write(path: Path, points: np.ndarray) -> None:
+    """Point format 0, steps of a 10^9th of the extent (the format stores integers)."""
+    laspy = _laspy(path)
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.offsets = points.min(axis=0)
+    header.scales = np.maximum(np.ptp(points, axis=0), 1e-9) * 1e-9
+    cloud = laspy.LasData(header)
+    cloud.xyz = points
+    cloud.write(str(path))
+
+
+def _laspy(path: Path):
+    try:
+        import laspy
+    except ImportError:
+        raise ValueError(
+            f"{path}: LAS and LAZ need laspy: install it by pip install 'jaxreg[las]'."
+        ) from None
+    return laspy

@@ -1,0 +1,71 @@
+"""PLY: ascii and binary of both byte orders, with any other properties and elements, by plyfile."""
+
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+
+def read(path: Path) -> np.ndarray:
+    """The vertices (n, 3), float64. Errors as `jaxreg.io.read_cloud`."""
+    try:
+        vertex = _open(path)["vertex"]
+        return np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
+    except KeyError:
+        raise ValueError(
+            f"{path} has no element 'vertex': it is no point cloud; export it again."
+        ) from None
+    except ValueError as error:
+        missing = "no field" in str(error)
+        reason = "its vertices lack x, y or z" if missing else str(error)
+        raise ValueError(f"{path}: {reason}: export it again.") from None
+
+
+def _open(path: Path) -> PlyData:
+    try:
+        return PlyData.read(str(path))
+    except PlyParseError as error:
+        # plyfile says which element and row, or which line of the header.
+        raise ValueError(f"malformed or truncated PLY ({error})") from None
+    except UnicodeDecodeError:
+        raise ValueError("the header is not ascii text") from None
+
+
+def write(path: Path, points: np.ndarray) -> None:
+    """Binary little-endian vertices x y z, double."""
+    rows = np.empty(len(points), [(axis, "<f8") for axis in "xyz"])
+    for axis, column in zip("xyz", points.T, strict=True):
+        rows[axis] = column
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+
+
+def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
+    """Write a PLY file again with its vertices (and normals) moved and everything else kept.
+
+    x, y, z become double, so that large offsets lose nothing.
+    """
+    data = _open(original)
+    elements = []
+    for element in data.elements:
+        if element.name == "vertex":
+            element = PlyElement.describe(_moved(element.data, rotation, translation), "vertex")
+        elements.append(element)
+    PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments).write(
+        str(path)
+    )
+
+
+def _moved(vertex: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    kinds = [(name, "f8" if name in "xyz" else vertex.dtype[name]) for name in vertex.dtype.names]
+    moved = np.empty(len(vertex), kinds)
+    for name in vertex.dtype.names:
+        moved[name] = vertex[name]
+    points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    for axis, column in zip("xyz", (points @ rotation.T + translation).T, strict=True):
+        moved[axis] = column
+    names = ("nx", "ny", "nz")
+    if set(names) <= set(vertex.dtype.names):
+        normals = np.stack([vertex[name] for name in names], axis=1)
+        for name, column in zip(names, (normals @ rotation.T).T, strict=True):
+            moved[name] = column
+    return moved
