@@ -15,7 +15,7 @@ from jaxreg.config import Config
 from jaxreg.data import data_root
 from jaxreg.options import parse
 from jaxreg.pictures import plot_curves
-from jaxreg.training import train
+from jaxreg.training import release, train
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +25,8 @@ class Options:
     config: Annotated[Config, tyro.conf.arg(name="")]
     workdir: str = ""
     """Directory of the run; one that holds a run is resumed."""
+    release: str = ""
+    """Write the best weights to jaxreg/weights under this name, with a card of how they were made."""
     data_root: str = ""
     """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
 
@@ -39,6 +41,8 @@ def main() -> None:
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"error: {error}")
     plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
+    if options.release:
+        release(options.release, workdir, f"python train.py {path} --workdir {workdir}")
     print(f"best checkpoint, metrics.jsonl and curves.png: {workdir}")
 
 

@@ -5,6 +5,7 @@ that was interrupted and resumed is therefore bit-equal to one that was not.
 """
 
 import functools
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from jaxreg.features import BATCH_AXIS
 from jaxreg.losses import LossTerms, step_losses, total_loss
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.model import Variables, init_variables, iterate
+from jaxreg.pretrained import save_weights
 from jaxreg.types import Pair
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
@@ -204,6 +206,23 @@ def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
     config, _ = checkpoint.best_config(workdir)
     with checkpoint.open_run(workdir, config) as run:
         return run.best(create_train_state(config)).average, config
+
+
+def release(name: str, workdir: str | Path, command: str) -> None:
+    """Write the best weights of a run into the package, with a card of how they were made."""
+    variables, config = load_checkpoint(workdir)
+    _, error = checkpoint.best_config(workdir)
+    lines = (Path(workdir) / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    entries = [json.loads(line) for line in lines]
+    best = next(entry for entry in entries if entry.get("val_mie_r_deg") == error)
+    card = {
+        "command": command,
+        "data": f"{config.data.name}, training shapes: {config.data.train_categories}",
+        "seed": config.train.seed,
+        "step": best["step"],
+        "validation": {k.removeprefix("val_"): v for k, v in best.items() if k[:4] == "val_"},
+    }
+    save_weights(Path(__file__).parent / "weights", name, variables, config, card)
 
 
 def shape_points(pairs: PairConfig) -> int:
