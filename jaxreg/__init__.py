@@ -9,6 +9,7 @@ from jaxreg.neighbors import knn, nearest_neighbor
 from jaxreg.numerics import included_angle
 from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.procrustes import weighted_procrustes
+from jaxreg.register import ScanRegistration, register
 from jaxreg.rigid import apply, compose, from_matrix, identity, inverse, to_matrix
 from jaxreg.types import Pair, PointCloud, Registration, RigidTransform
 
@@ -20,6 +21,7 @@ __all__ = [
     "PointCloud",
     "Registration",
     "RigidTransform",
+    "ScanRegistration",
     "apply",
     "available_weights",
     "compose",
@@ -32,6 +34,7 @@ __all__ = [
     "load_config",
     "load_pretrained",
     "nearest_neighbor",
+    "register",
     "register_pair",
     "to_matrix",
     "weighted_procrustes",

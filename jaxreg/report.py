@@ -24,15 +24,15 @@ Result = Mapping[str, float | str | None]
 
 _COLUMNS = {
     "pairs": ("pairs", "d"),
-    "mae_r_deg": ("MAE(R) deg", ".4f"),
-    "mie_r_deg": ("MIE(R) deg", ".4f"),
-    "mie_r_deg_float32_acos": ("as published", ".4f"),
-    "median_rre_deg": ("median deg", ".4f"),
-    "mae_t": ("MAE(t)", ".5f"),
-    "mie_t": ("MIE(t)", ".5f"),
+    "mae_r_deg": ("MAE(R) deg", ".3g"),
+    "mie_r_deg": ("MIE(R) deg", ".3g"),
+    "mie_r_deg_float32_acos": ("as published", ".3g"),
+    "median_rre_deg": ("median deg", ".3g"),
+    "mae_t": ("MAE(t)", ".3g"),
+    "mie_t": ("MIE(t)", ".3g"),
     "recall_1deg": ("recall 1 deg", ".3f"),
     "recall_5deg": ("recall 5 deg", ".3f"),
-    "worst_rre_deg": ("worst deg", ".4f"),
+    "worst_rre_deg": ("worst deg", ".3g"),
     "seconds_per_pair": ("s / pair", ".4f"),
 }
 _SECONDS_BETWEEN_LINES = 20.0

@@ -26,7 +26,7 @@ def test_one_result_is_a_row_a_metric():
     text = text_of([RESULT], title="unseen objects")
     lines = [line for line in text.splitlines() if "MAE(R)" in line]
     assert len(lines) == 1
-    assert "0.0012" in lines[0]
+    assert "0.00123" in lines[0]
     assert "unseen objects" in text
     assert "icp" in text
     assert "s / pair" not in text, "a metric that no result has is left out"
