@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 from jax.lax import Precision
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxreg.dense.compatibility import second_order, spectral_weights
 from jaxreg.dense.nearest import NearestGrid, lookup

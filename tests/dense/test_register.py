@@ -1,0 +1,80 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxreg.config import DenseConfig
+from jaxreg.dense import register_dense
+
+pytestmark = pytest.mark.float32
+CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=12, finalists=3)
+solve = jax.jit(
+    lambda x, y, a, b: register_dense(x, y, source_mask=a, reference_mask=b, config=CONFIG)
+)  # noqa: E731,E501
+
+
+def shape(rng, n):
+    """Three boxes of different sizes, glued: no symmetry."""
+    sizes = np.array([[1.0, 0.3, 0.2], [0.3, 0.7, 0.25], [0.2, 0.25, 0.5]])
+    centres = np.array([[0.0, 0, 0], [0.6, 0.4, 0], [-0.5, 0.1, 0.3]])
+    box, side = rng.integers(0, 3, n), rng.integers(0, 3, n)
+    points = rng.uniform(-0.5, 0.5, (n, 3))
+    points[np.arange(n), side] = rng.choice([-0.5, 0.5], n)
+    return points * sizes[box] + centres[box]
+
+
+def padded(points, rows, value):
+    full = np.full((rows, 3), value, np.float32)
+    full[: len(points)] = points
+    return jnp.asarray(full), jnp.arange(rows) < len(points)
+
+
+def make_pair(seed, scale=1.0):
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=rng).as_matrix()
+    source, reference = scale * shape(rng, 380), scale * (shape(rng, 340) @ turn.T + 2)
+    return source, reference, turn
+
+
+def angle_deg(found, truth):
+    return np.degrees(Rotation.from_matrix(np.asarray(found) @ truth.T).magnitude())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_any_rotation_of_another_sampling_with_padding(scale, seed):
+    source, reference, turn = make_pair(seed, scale)
+    x, mask = padded(source, 400, np.nan)
+    y, other = padded(reference, 400, np.nan)
+    found = solve(x, y, mask, other)
+    assert angle_deg(found.rotation, turn) < 2
+    np.testing.assert_allclose(found.translation, 2 * scale, atol=0.05 * scale)
+    assert bool(found.valid)
+    confidence = np.asarray(found.confidence)
+    assert np.all(confidence[380:] == 0)
+    assert confidence[:380].mean() > 0.5
+    moved = source @ np.asarray(found.rotation).T + np.asarray(found.translation)
+    gap = np.linalg.norm(moved - np.asarray(found.correspondences)[:380], axis=1)
+    assert np.median(gap) < 0.08 * scale
+
+
+def test_no_valid_point_gives_the_identity(seed):
+    source, reference, _ = make_pair(seed)
+    x, mask = padded(source, 400, np.nan)
+    y, other = padded(reference, 400, np.nan)
+    found = solve(x, y, mask & False, other)
+    assert not bool(found.valid)
+    np.testing.assert_allclose(found.transformation, np.eye(4), atol=1e-6)
+    assert np.isfinite(found.correspondences).all()
+
+
+@pytest.mark.slow
+def test_derivatives_are_finite_and_do_not_see_padding(seed):
+    source, reference, _ = make_pair(seed)
+    x, mask = padded(source, 400, np.nan)
+    y, other = padded(reference, 400, np.nan)
+    total = lambda x: jnp.sum(solve(x, y, mask, other).rotation[0])  # noqa: E731
+    gradient = np.asarray(jax.grad(total)(x))
+    assert np.isfinite(gradient).all()
+    assert np.any(gradient[:380] != 0)
+    assert np.all(gradient[380:] == 0)
