@@ -1,0 +1,152 @@
+"""One HTML file that shows clouds to turn, and a registration before and after, without a network."""
+
+import base64
+import html
+import json
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxreg.register import ScanRegistration
+
+_SHOWN = 20_000
+"""Most points of a cloud on the page: 120 kB, and a frame in a few milliseconds."""
+_COLOURS = ("source", "reference", "aligned")
+
+
+def write_registration_page(
+    path: str | Path,
+    source: Float[np.ndarray, "n 3"],
+    reference: Float[np.ndarray, "m 3"],
+    result: ScanRegistration,
+    *,
+    names: tuple[str, str] = ("source", "reference"),
+) -> None:
+    """A page with both clouds, a switch before/after, confidence as colour, figures and verdict.
+
+    Points that are not finite are left out. Large clouds are thinned evenly for display.
+    """
+    kept, rows = np.isfinite(source).all(axis=1), shown_rows(source)
+    origin = _middle(reference)
+    clouds = [
+        _cloud(names[0], source[rows], origin, len(source), moves=True)
+        | {"confidence": _packed(np.round(255 * result.confidence[rows]).astype(np.uint8))},
+        _cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
+    ]
+    content = {
+        "clouds": clouds,
+        "motion": _motion(result, source[kept], origin),
+        "figures": [[name, value] for name, value in figures(result).items()],
+        "verdict": {"text": verdict_line(result), "good": result.success},
+    }
+    _write(path, f"{names[0]} on {names[1]}", content)
+
+
+def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> None:
+    """A page with clouds as they are, all in one frame."""
+    origin = _middle(np.concatenate([_shown(points) for points in clouds.values()]))
+    shown = [
+        _cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
+        for i, (name, points) in enumerate(clouds.items())
+    ]
+    sizes = [
+        [name, " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))]
+        for name, points in clouds.items()
+    ]
+    _write(path, ", ".join(clouds), {"clouds": shown, "motion": None, "figures": sizes})
+
+
+def verdict_line(result: ScanRegistration) -> str:
+    """Success or not, in words, with the probability."""
+    chance = f"probability {result.probability:.2f}"
+    if result.success:
+        return f"success ({chance})"
+    return f"not trustworthy ({chance} that the pose is right)"
+
+
+def figures(result: ScanRegistration) -> dict[str, str]:
+    """What a reader wants to know, as text."""
+    _, angle = _axis_angle(result.rotation)
+    deviations = np.sqrt(np.maximum(np.diag(result.covariance), 0))
+    return {
+        "rotation": f"{math.degrees(angle):.3f} deg",
+        "translation": ", ".join(f"{x:.6g}" for x in result.translation),
+        "overlap": f"{result.overlap:.2f}",
+        "fitness": f"{result.fitness:.2f} within {result.reach:.4g}",
+        "inlier rmse": f"{result.inlier_rmse:.4g}",
+        "one sigma": f"{math.degrees(deviations[:3].max()):.2g} deg, {deviations[3:].max():.2g}",
+        "weak directions": "\n".join(result.weak_directions) or "none",
+        "dropped points": str(result.dropped),
+        "time": f"{result.seconds:.2f} s",
+    }
+
+
+def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
+    template = (resources.files("jaxreg") / "viewer.html").read_text("utf-8")
+    # "</" would end the script element that holds the data.
+    data = json.dumps(content).replace("</", "<\\/")
+    page = template.replace("{{title}}", html.escape(title)).replace("{{data}}", data)
+    Path(path).write_text(page, encoding="utf-8")
+
+
+def _cloud(
+    name: str,
+    points: np.ndarray,
+    origin: np.ndarray,
+    count: int,
+    *,
+    colour: str = "source",
+    moves: bool = False,
+) -> dict[str, Any]:
+    """Points relative to `origin` as 16-bit steps about their own middle."""
+    relative = points - origin
+    centre = (relative.min(axis=0) + relative.max(axis=0)) / 2
+    step = max(float(np.abs(relative - centre).max()) / 32767, np.finfo(np.float32).tiny)
+    steps = np.round((relative - centre) / step).astype("<i2")
+    place = {"points": _packed(steps), "centre": centre.tolist(), "step": step}
+    return {"name": name, "colour": colour, "moves": moves, "count": count} | place
+
+
+def _motion(result: ScanRegistration, source: np.ndarray, origin: np.ndarray) -> dict[str, Any]:
+    """The motion as a turn about the source's centroid and the way of that centroid."""
+    axis, angle = _axis_angle(result.rotation)
+    before = source.mean(axis=0)
+    after = result.rotation @ before + result.translation
+    ways = {"before": (before - origin).tolist(), "after": (after - origin).tolist()}
+    return {"axis": axis.tolist(), "angle": angle} | ways
+
+
+def _axis_angle(rotation: np.ndarray) -> tuple[np.ndarray, float]:
+    from scipy.spatial.transform import Rotation
+
+    vector = Rotation.from_matrix(rotation).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    return (vector / angle, angle) if angle > 0 else (np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def _middle(points: Sequence) -> np.ndarray:
+    """Coordinates are shown relative to this: JavaScript's float32 arrays know no UTM offsets."""
+    points = np.asarray(points)
+    points = points[np.isfinite(points).all(axis=1)]
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
+def _shown(points: np.ndarray) -> np.ndarray:
+    return points[shown_rows(points)]
+
+
+def shown_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "k"]:
+    """The finite rows, or an even share of them where a picture needs no more."""
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(rows) <= _SHOWN:
+        return rows
+    return np.sort(np.random.default_rng(0).choice(rows, _SHOWN, replace=False))
+
+
+def _packed(array: np.ndarray) -> str:
+    return base64.b64encode(array.tobytes()).decode("ascii")
