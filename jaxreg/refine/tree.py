@@ -73,7 +73,7 @@ def iterate(
             pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
             new = _step(
                 jax.tree.map(jnp.asarray, pose), source[2:], reference[2:], pairs,
-                weighting.scale, weighting.max_distance, widths[i],
+                weighting.scale, weighting.max_distance, float(widths[i]),
                 kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
             )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)

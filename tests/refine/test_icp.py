@@ -9,9 +9,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
+from jaxreg.refine import icp as room
 from jaxreg.refine.frame import check_clouds
-from jaxreg.refine.icp import icp
 from jaxreg.types import RigidTransform
+
+icp = jax.jit(
+    room.icp, static_argnames=("iterations", "kernel", "trim", "anneal", "both_directions")
+)
 
 
 def make_pair(seed, n=80, m=None, angle_deg=8.0, noise=0.0):
