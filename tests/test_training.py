@@ -22,8 +22,19 @@ def config() -> Config:
         {
             "model": {"channels": [4, 8], "width": 8, "n_inliers": 12, "iterations": 2, "k": 3},
             "pairs": {"points": 32, "kept": 24},
-            "data": {"name": "shapes", "train_shapes": 8, "test_shapes": 4, "validation_share": 0.5},
-            "train": {"steps": 4, "batch": 2, "validate_every": 2, "validation_pairs": 2, "warmup": 1},
+            "data": {
+                "name": "shapes",
+                "train_shapes": 8,
+                "test_shapes": 4,
+                "validation_share": 0.5,
+            },
+            "train": {
+                "steps": 4,
+                "batch": 2,
+                "validate_every": 2,
+                "validation_pairs": 2,
+                "warmup": 1,
+            },
         }
     )
 
@@ -56,9 +67,7 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     square = sum(jnp.sum(g * g) for g in jax.tree.leaves(gradient))
     before, _ = loss(params, statistics, pairs)
     length = 1e-3 * before / square
-    after, _ = loss(
-        jax.tree.map(lambda p, g: p - length * g, params, gradient), statistics, pairs
-    )
+    after, _ = loss(jax.tree.map(lambda p, g: p - length * g, params, gradient), statistics, pairs)
     assert after < before
 
 

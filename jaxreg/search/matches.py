@@ -57,4 +57,4 @@ def match_histograms(
 
 def _best_three(likeness: Array) -> tuple[Array, Array]:
     # The barrier keeps slices from turning the selection into a sort of every row.
-    return jax.lax.optimization_barrier(jax.lax.top_k(likeness, 3))
+    return tuple(jax.lax.optimization_barrier(jax.lax.top_k(likeness, 3)))
