@@ -222,8 +222,10 @@ class RegisterConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DenseConfig:
-    """Global registration without learning (`jaxreg.dense`). Lengths are in units in which a usual
-    shape fills the unit sphere, angles in radians."""
+    """Global registration without learning (`jaxreg.dense`).
+
+    Lengths are in units in which a usual shape fills the unit sphere, angles in radians.
+    """
 
     unit: float = 0.0
     """That unit, in the unit of the clouds. 0: twice the clouds' root mean square radius."""
