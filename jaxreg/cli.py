@@ -29,9 +29,9 @@ Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
 class Register:
     """Lay one scan on another, say how far the result can be trusted, and write what is asked for."""
 
-    source: tyro.conf.Positional[Path]
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
     """Cloud that moves: PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
-    reference: tyro.conf.Positional[Path]
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
     """Cloud that stays."""
     output: Output = None
     """Write the aligned source here (PLY keeps colours and other properties)."""
@@ -57,7 +57,7 @@ class Register:
 class Info:
     """Describe a cloud: number of points, extent, spacing, defects."""
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,13 +163,18 @@ def _draw(path: Path, source, reference, result) -> None:
     from jaxreg.types import RigidTransform
 
     rows = viewer.shown_rows(source)
+    moving, fixed = source[rows], reference[viewer.shown_rows(reference)]
+    shift = viewer.brought_near(moving, fixed)
+    title = viewer.verdict_line(result)
+    if shift.any():
+        title += "; before: source brought near"
     plot_pair(
-        source[rows],
-        reference[viewer.shown_rows(reference)],
-        RigidTransform(result.rotation, result.translation),
+        moving + shift,
+        fixed,
+        RigidTransform(result.rotation, result.translation - result.rotation @ shift),
         path,
         confidence=result.confidence[rows],
-        title=viewer.verdict_line(result),
+        title=title,
     )
 
 

@@ -141,13 +141,15 @@ def plot_curves(metrics: str | Path, path: str | Path) -> None:
     steps = columns.pop("step")
     validation = {name: columns.pop(name) for name in list(columns) if name.startswith("val_")}
     columns.pop("gradient_norm", None)
-    figure = Figure(figsize=(11, 4), layout="constrained")
+    figure = Figure(figsize=(15, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name, values in columns.items():
         left.plot(
             *_binned(steps, values), label=name.replace("_", " "), lw=2 if name == "loss" else 1
         )
-    left.set(title="training loss and its terms", xlabel="step", yscale="log")
+    # A mean surprise below zero (the entries of G can exceed 1) has no place on a logarithmic axis.
+    left.set(title="training loss and its terms", xlabel="step")
+    left.set_yscale("symlog", linthresh=1e-2)
     for name, label in _VALIDATION.items():
         if name in validation:
             known = np.isfinite(validation[name])
@@ -162,7 +164,7 @@ def plot_curves(metrics: str | Path, path: str | Path) -> None:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.lines:
-            axes.legend(frameon=False)
+            axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(path, dpi=150, facecolor="white")
 
 

@@ -31,16 +31,17 @@ def write_registration_page(
 
     Points that are not finite are left out. Large clouds are thinned evenly for display.
     """
-    kept, rows = np.isfinite(source).all(axis=1), shown_rows(source)
+    rows = shown_rows(source)
     origin = _middle(reference)
+    shift = brought_near(source[rows], reference[shown_rows(reference)])
     clouds = [
-        _cloud(names[0], source[rows], origin, len(source), moves=True)
+        _cloud(names[0], source[rows] + shift, origin, len(source), moves=True)
         | {"confidence": _packed(np.round(255 * result.confidence[rows]).astype(np.uint8))},
         _cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
     ]
     content = {
         "clouds": clouds,
-        "motion": _motion(result, source[kept], origin),
+        "motion": _motion(result, source[rows], origin, shift),
         "figures": [[name, value] for name, value in figures(result).items()],
         "verdict": {"text": verdict_line(result), "good": result.success},
     }
@@ -112,13 +113,35 @@ def _cloud(
     return {"name": name, "colour": colour, "moves": moves, "count": count} | place
 
 
-def _motion(result: ScanRegistration, source: np.ndarray, origin: np.ndarray) -> dict[str, Any]:
-    """The motion as a turn about the source's centroid and the way of that centroid."""
+def brought_near(
+    source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "3"]:
+    """How to shift the source for a picture of "before" in which both clouds can be seen.
+
+    Zero unless the gap between them is wider than the clouds. All points must be finite.
+    """
+    centres = source.mean(axis=0), reference.mean(axis=0)
+    radii = [
+        np.linalg.norm(points - centre, axis=1).max()
+        for points, centre in zip((source, reference), centres, strict=True)
+    ]
+    way = centres[0] - centres[1]
+    distance, most = np.linalg.norm(way), 1.5 * sum(radii)
+    return np.zeros(3) if distance <= most else way * (most / distance - 1)
+
+
+def _motion(
+    result: ScanRegistration, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
+) -> dict[str, Any]:
+    """The motion as a turn about the source's centroid and the way of that centroid.
+
+    The page has the source shifted before the motion, and ends where it ends.
+    """
     axis, angle = _axis_angle(result.rotation)
-    before = source.mean(axis=0)
-    after = result.rotation @ before + result.translation
+    centre = source.mean(axis=0)
+    before, after = centre + shift, result.rotation @ centre + result.translation
     ways = {"before": (before - origin).tolist(), "after": (after - origin).tolist()}
-    return {"axis": axis.tolist(), "angle": angle} | ways
+    return {"axis": axis.tolist(), "angle": angle, "shortened": bool(shift.any())} | ways
 
 
 def _axis_angle(rotation: np.ndarray) -> tuple[np.ndarray, float]:

@@ -36,7 +36,7 @@ def align_coarse(
         moved = rigid.apply(pose, source.points)
         nearest = lookup(grid, moved)
         target = reference.points[nearest]
-        weight = _closeness(moved - target, width) * source.mask
+        weight = jnp.where(source.mask, _closeness(moved - target, width), 0)
         weighted = weight[:, None, None] * metric[nearest]
         return gauss_newton_step(pose, moved, target, weighted), None
 

@@ -51,12 +51,13 @@ def select_candidates(
     similarity = jnp.where(valid, similarity, -2)
     by_row, column = _best(similarity, matches)
     by_column, row = _best(similarity.T, matches)
-    source = jnp.concatenate([jnp.repeat(jnp.arange(n), matches), row.reshape(-1)])
-    reference = jnp.concatenate([column.reshape(-1), jnp.repeat(jnp.arange(m), matches)])
+    rows, columns = (jnp.repeat(jnp.arange(x, dtype=row.dtype), matches) for x in (n, m))
+    source = jnp.concatenate([rows, row.reshape(-1)])
+    reference = jnp.concatenate([column.reshape(-1), columns])
     value = similarity[source, reference]
     margins = [(best[:, :-1] - best[:, -1:]).reshape(-1) for best in (by_row, by_column)]
     mutual = (value >= by_row[source, 0]) & (value >= by_column[reference, 0])
-    clarity = jnp.concatenate(margins) + _MUTUAL_BONUS * mutual
+    clarity = jnp.concatenate(margins) + jnp.where(mutual, _MUTUAL_BONUS, 0)
     listed = (jnp.arange(value.shape[0]) >= n * matches) & (value >= by_row[source, matches - 1])
     clarity = jnp.where(listed | (value <= -2), -jnp.inf, clarity)
     clarity, chosen = jax.lax.top_k(clarity, keep)

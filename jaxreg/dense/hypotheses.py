@@ -47,7 +47,8 @@ def screen(
     squared = jnp.sum((moved - reference.points[nearest]) ** 2, axis=-1)
     facing = jnp.sum(normals * reference.normals[nearest], axis=-1) ** 2
     overlap = jnp.where(source.mask, jnp.exp(-squared / (2 * width**2)) * facing, 0)
-    return jnp.sum(overlap, axis=1) / jnp.maximum(jnp.sum(source.mask), 1)
+    count = jnp.maximum(jnp.sum(source.mask), 1).astype(overlap.dtype)
+    return jnp.sum(overlap, axis=1) / count
 
 
 def pick_distinct(

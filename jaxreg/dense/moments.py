@@ -130,7 +130,7 @@ def _normals(points: Array, squared: Array, valid: Array, radius: float) -> Arra
 
 def _means(squared: Array, table: Array, valid: Array, radius: float) -> Array:
     """Gaussian-weighted mean of the rows of `table` around every point."""
-    weights = jnp.exp(-squared / (2 * (radius / 2) ** 2)) * valid[None, :]
+    weights = jnp.where(valid[None, :], jnp.exp(-squared / (2 * (radius / 2) ** 2)), 0)
     total = jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), _SMALLEST_NORM)
     return jnp.matmul(weights, table, precision=Precision.HIGHEST) / total
 

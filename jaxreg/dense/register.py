@@ -181,7 +181,8 @@ def _registration(where, pose, a: Surface, b: Surface, config: DenseConfig) -> R
     moved = rigid.apply(pose, a.points)
     nearest = nearest_packed(moved, b.points, b.mask)
     squared = jnp.sum((moved - b.points[nearest]) ** 2, axis=-1)
-    trust = jnp.exp(-squared / (2 * config.final_widths[-1] ** 2)) * (a.mask & valid)
+    trust = jnp.exp(-squared / (2 * config.final_widths[-1] ** 2))
+    trust = jnp.where(a.mask & valid, trust, 0)
     pose = frame.transform_out(where, pose)
     correspondences = b.points[nearest] * where.length + where.reference_centre
     pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(a.points.dtype))

@@ -73,7 +73,7 @@ def _one_way(
     match = close * jnp.exp(-(height**2) / (2 * plane_width**2)) * facing
     off = (squared > (2 * width) ** 2) & (squared < (6 * width) ** 2)
     inside = jnp.where(off, jnp.maximum(0, 1 - other.openness[nearest] / rim), 0)
-    count = jnp.maximum(jnp.sum(moved.mask), 1)
+    count = jnp.maximum(jnp.sum(moved.mask), 1).astype(close.dtype)
     close, match, inside = (
         jnp.sum(jnp.where(moved.mask, value, 0)) / count for value in (close, match, inside)
     )
