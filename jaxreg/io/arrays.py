@@ -13,17 +13,14 @@ def read(path: Path) -> np.ndarray:
     or the only one that could be a cloud.
     """
     try:
-        content = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if not isinstance(content, np.ndarray):
+                content = {name: content[name] for name in content.files}
     except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
         hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
         raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
-    if isinstance(content, np.ndarray):
-        return _points(content, str(path))
-    with content:
-        try:
-            return _chosen({name: content[name] for name in content.files}, path)
-        except (zipfile.BadZipFile, EOFError, OSError) as error:
-            raise ValueError(f"{path} is damaged ({error}): save it again.") from None
+    return _chosen(content, path) if isinstance(content, dict) else _points(content, str(path))
 
 
 def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:

@@ -23,6 +23,8 @@ def read(path: Path) -> np.ndarray:
     kind = path.suffix.lower().lstrip(".")
     if kind == "off":
         content = _GLUED.sub(rb"\1\n", content, count=1)
+    elif kind == "stl" and _cut(content):
+        raise ValueError(f"{path} is truncated: it announces more triangles: export it again.")
     try:
         shape = trimesh.load(io.BytesIO(content), file_type=kind, process=False)
     except Exception as error:  # noqa: BLE001 - trimesh raises whatever its parsers raise
@@ -37,6 +39,13 @@ def read(path: Path) -> np.ndarray:
     if len(faces) == 0:
         return vertices
     return _sampled(path, vertices, np.asarray(faces))
+
+
+def _cut(content: bytes) -> bool:
+    """Whether a binary STL file is shorter than it says; ascii ones begin with "solid"."""
+    if content.lstrip()[:5] == b"solid":
+        return False
+    return len(content) < 84 + 50 * int.from_bytes(content[80:84], "little")
 
 
 def _sampled(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

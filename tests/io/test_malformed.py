@@ -1,0 +1,122 @@
+"""T26: every malformed file is a ValueError that names the file, the place and what to do."""
+
+import pickle
+import struct
+
+import numpy as np
+import pytest
+
+from jaxreg import io
+
+PLY = "ply\nformat {kind} 1.0\nelement vertex {n}\n{properties}end_header\n"
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+PCD = (
+    "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
+    "DATA {kind}\n"
+)
+
+
+def ply(kind="ascii", n=3, properties=XYZ) -> bytes:
+    return PLY.format(kind=kind, n=n, properties=properties).encode()
+
+
+ROW = struct.pack("<fff", 1, 2, 3)
+CASES = {
+    "empty.ply": (b"", "empty"),
+    "nothing.ply": (ply(n=0), "no point"),
+    "short.ply": (ply() + b"1 2 3\n4 5 6\n", "row 2"),
+    "word.ply": (ply() + b"1 2 3\n4 five 6\n7 8 9\n", "row 1"),
+    "short-binary.ply": (ply("binary_little_endian") + 2 * ROW, "row 2"),
+    "no-z.ply": (
+        ply(properties="property float x\nproperty float y\n") + b"1 2\n" * 3,
+        "x, y or z",
+    ),
+    "no-vertex.ply": (
+        b"ply\nformat ascii 1.0\nelement edge 0\nproperty int a\nend_header\n",
+        "vertex",
+    ),
+    "cut-header.ply": (b"ply\nformat ascii 1.0\nelement ver", "export it again"),
+    "not.ply": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "export it again"),
+    "empty.xyz": (b"", "empty"),
+    "comments.xyz": (b"# nothing\n\n", "no point"),
+    "header.csv": (b"x,y,z\n", "no point"),
+    "two-columns.xyz": (b"1 2 3\n4 5\n6 7 8\n", "line 2"),
+    "word.txt": (b"# head\n1 2 3\n4 5 six\n", "line 3"),
+    "one-word.txt": (b"hello\n1 2 3\n", "line 1"),
+    "binary.txt": (b"\xff\xfe\x00\x81" * 10, "no text"),
+    "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),
+    "word.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n4 x 6\n7 8 9\n", "point 1"),
+    "short-binary.pcd": (PCD.format(kind="binary").encode() + ROW, "row 1"),
+    "short-packed.pcd": (PCD.format(kind="binary_compressed").encode() + b"\0" * 6, "truncated"),
+    "cut-packed.pcd": (
+        PCD.format(kind="binary_compressed").encode() + struct.pack("<II", 50, 36) + b"\x05abc",
+        "truncated",
+    ),
+    "odd.pcd": (PCD.format(kind="holographic").encode(), "encoding"),
+    "no-x.pcd": (PCD.format(kind="ascii").replace("x y z", "a b c").encode(), "without x y z"),
+    "mismatch.pcd": (PCD.format(kind="ascii").replace("SIZE 4 4 4", "SIZE 4 4").encode(), "SIZE"),
+    "no-header.pcd": (b"1 2 3\n4 5 6\n", "header"),
+    "cut.npy": (b"\x93NUMPY\x01\x00", "save"),
+    "cut.npz": (b"PK\x03\x04rest", "save"),
+    "text.npy": (b"1 2 3\n", "save"),
+    "cut.off": (b"OFF\n8 12 0\n0 0 0\n", "malformed or truncated"),
+    "bad-face.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n", "export it again"),
+    "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 20, "truncated"),
+    "unknown.xyzzy": (b"1 2 3\n", "suffix"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_malformed_file_is_named_with_place_and_remedy(tmp_path, name):
+    content, told = CASES[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=told) as caught:
+        io.read_cloud(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(ValueError, match="no such file"):
+        io.read_cloud(tmp_path / "absent.ply")
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_truncated_las(tmp_path, suffix):
+    pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    path = tmp_path / f"a{suffix}"
+    io.write_cloud(path, np.random.default_rng(0).normal(size=(500, 3)))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match="truncated"):
+        io.read_cloud(path)
+
+
+def test_pickles_are_never_loaded(tmp_path):
+    class Harm:
+        def __reduce__(self):
+            return (pytest.fail, ("a pickle was executed",))
+
+    np.save(tmp_path / "a.npy", np.array([Harm()], object), allow_pickle=True)
+    (tmp_path / "b.npy").write_bytes(pickle.dumps(Harm()))
+    for name in ("a.npy", "b.npy"):
+        with pytest.raises(ValueError, match="cannot be read"):
+            io.read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(("shape", "dtype"), [((5,), float), ((5, 2), float), ((5, 3), "U3")])
+def test_arrays_that_are_no_cloud(tmp_path, shape, dtype):
+    np.save(tmp_path / "a.npy", np.zeros(shape, dtype))
+    with pytest.raises(ValueError, match=r"not numbers \(n, 3\)"):
+        io.read_cloud(tmp_path / "a.npy")
+
+
+def test_archive_with_two_clouds_asks_for_a_name(tmp_path):
+    np.savez(tmp_path / "a.npz", one=np.zeros((4, 3)), two=np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"one \(4, 3\), two \(4, 3\).*'points'"):
+        io.read_cloud(tmp_path / "a.npz")
+
+
+def test_unwritable(tmp_path):
+    with pytest.raises(ValueError, match="cannot be written as '.obj'"):
+        io.write_cloud(tmp_path / "a.obj", np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="does not exist"):
+        io.write_cloud(tmp_path / "nowhere" / "a.ply", np.zeros((3, 3)))
