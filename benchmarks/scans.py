@@ -45,7 +45,8 @@ def scan_pairs(folder: Path, overlap: float) -> list[tuple[int, int, np.ndarray]
     """(i, j, T) of the pairs with enough overlap; T maps fragment j into the frame of fragment i."""
     rows = [line.split() for line in (folder / "gt_overlap.txt").read_text().splitlines()[1:]]
     enough = {
-        (int(i), int(j)) for name, i, j, a, b, *_ in rows
+        (int(i), int(j))
+        for name, i, j, a, b, *_ in rows
         if name == "3DMatch" and (float(a) + float(b)) / 2 >= overlap
     }
     lines = (folder / "gt.log").read_text().splitlines()
@@ -72,7 +73,7 @@ def turned(points: np.ndarray, rng: np.random.Generator, rotation: str) -> np.nd
 
 
 def ours(rotation: str) -> Callable:
-    """jaxreg as anybody would call it."""
+    """Jaxreg as anybody would call it."""
     return lambda x, y: register(x, y, rotation=rotation)
 
 
@@ -91,8 +92,12 @@ def ransac_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         around = o3d.geometry.KDTreeSearchParamHybrid(5 * VOXEL, 100)
         features.append(pipelines.compute_fpfh_feature(cloud, around))
     coarse = pipelines.registration_ransac_based_on_feature_matching(
-        *clouds, *features, True, 1.5 * VOXEL,
-        pipelines.TransformationEstimationPointToPoint(False), 3,
+        *clouds,
+        *features,
+        True,
+        1.5 * VOXEL,
+        pipelines.TransformationEstimationPointToPoint(False),
+        3,
         [
             pipelines.CorrespondenceCheckerBasedOnEdgeLength(0.9),
             pipelines.CorrespondenceCheckerBasedOnDistance(1.5 * VOXEL),
@@ -107,7 +112,9 @@ def open3d_icp(clouds, initial: np.ndarray) -> np.ndarray:
 
     pipelines = o3d.pipelines.registration
     return pipelines.registration_icp(
-        *clouds, 0.4 * VOXEL * 2, initial,
+        *clouds,
+        0.4 * VOXEL * 2,
+        initial,
         pipelines.TransformationEstimationPointToPlane(),
     ).transformation
 

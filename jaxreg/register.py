@@ -37,7 +37,8 @@ class ScanRegistration(NamedTuple):
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
     reference. `weak_directions` names the motions that the clouds hardly resist. `success` is False
     when the pose should not be trusted, `probability` is the calibrated chance that it is right.
-    `dropped` counts the non-finite rows of both clouds.
+    `evidence` is what that chance is computed from. `dropped` counts the non-finite rows of both
+    clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -53,6 +54,7 @@ class ScanRegistration(NamedTuple):
     weak_directions: tuple[str, ...]
     success: bool
     probability: float
+    evidence: verdict.Evidence
     seconds: float
     dropped: int
 
@@ -216,6 +218,7 @@ def _result(
         weak_directions=tuple(d.name for d in weak_directions(refined.uncertainty)),
         success=chance >= verdict.TRUSTED,
         probability=chance,
+        evidence=judged,
         seconds=time.perf_counter() - begin,
         dropped=int(np.sum(~moving.kept) + np.sum(~fixed.kept)),
     )

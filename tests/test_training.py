@@ -61,9 +61,9 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     pairs = training.draw_batch(state.step, shapes, config)
     params, statistics = state.variables["params"], state.variables["batch_stats"]
     loss = jax.jit(functools.partial(training.batch_loss, config=config))
-    gradient, _ = jax.grad(training.batch_loss, has_aux=True)(
-        params, statistics, pairs, config=config
-    )
+    gradient, _ = jax.jit(
+        jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True)
+    )(params, statistics, pairs)
     square = sum(jnp.sum(g * g) for g in jax.tree.leaves(gradient))
     before, _ = loss(params, statistics, pairs)
     length = 1e-3 * before / square
@@ -73,12 +73,6 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
 
 def test_a_resumed_run_equals_an_unbroken_one(config, tmp_path, monkeypatch):
     unbroken = training.train(config, tmp_path / "unbroken")
-    step, calls = training.train_step, 0
-
-    def killed(*arguments, **options):
-        nonlocal calls
-        calls += 1
-        return step(*arguments, **options)
 
     class Killed(Exception):
         pass

@@ -41,7 +41,7 @@ def hypotheses(
     _, members = jax.lax.top_k(second[chosen], partners)
     members = jnp.concatenate([chosen[:, None], members], axis=1)
     local = jax.vmap(lambda index: first[index][:, index])(members)
-    weights = jax.vmap(_principal)(local) * mask[members]
+    weights = jnp.where(mask[members], jax.vmap(_principal)(local), 0)
     poses = jax.vmap(weighted_procrustes)(source[members], reference[members], weights)
     for _ in range(_REFITS):
         poses, support = _refitted(poses, source, reference, mask, tolerance)

@@ -41,10 +41,11 @@ def match_histograms(
     likeness = jnp.where(both, likeness, -1)
     forward, j = _best_three(likeness)
     backward, i = _best_three(likeness.T)
-    rows, columns = jnp.arange(n), jnp.arange(m)
+    rows, columns = jnp.arange(n, dtype=i.dtype), jnp.arange(m, dtype=i.dtype)
     mutual, found_twice = i[j[:, 0], 0] == rows, j[i[:, 0], 0] == columns
     margin = jnp.concatenate([forward[:, 0] - forward[:, 2], backward[:, 0] - backward[:, 2]])
-    margin = margin + _MUTUAL * jnp.concatenate([mutual, jnp.zeros(m, bool)])
+    found_both_ways = jnp.concatenate([mutual, jnp.zeros(m, bool)])
+    margin = margin + jnp.where(found_both_ways, _MUTUAL, 0).astype(margin.dtype)
     valid = jnp.concatenate([source_mask, reference_mask & ~found_twice])
     valid = valid & jnp.any(source_mask) & jnp.any(reference_mask)
     score, best = jax.lax.top_k(jnp.where(valid, margin, -jnp.inf), min(kept, n + m))

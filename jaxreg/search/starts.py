@@ -48,7 +48,8 @@ def truncated_residual(
     squared = jnp.minimum(jnp.where(both, squared, jnp.inf), limit**2) / limit**2
     total = jnp.sum(jnp.min(squared, axis=1), where=source_mask)
     total += jnp.sum(jnp.min(squared, axis=0), where=reference_mask)
-    return total / jnp.maximum(jnp.sum(source_mask) + jnp.sum(reference_mask), 1)
+    count = jnp.maximum(jnp.sum(source_mask) + jnp.sum(reference_mask), 1)
+    return total / count.astype(total.dtype)
 
 
 def multi_start(
@@ -84,7 +85,8 @@ def multi_start(
         )
 
     centroids = [
-        jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / jnp.maximum(jnp.sum(mask), 1)
+        jnp.sum(jnp.where(mask[:, None], points, 0), axis=0)
+        / jnp.maximum(jnp.sum(mask, dtype=points.dtype), 1)
         for points, mask in ((source, source_mask), (reference, reference_mask))
     ]
     turned = jnp.matmul(rotations, centroids[0], precision=Precision.HIGHEST)

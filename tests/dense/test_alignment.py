@@ -10,6 +10,8 @@ from jaxreg.dense.nearest import nearest_grid
 from jaxreg.dense.surface import Surface
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 WIDTHS = (0.3, 0.2, 0.15, 0.1, 0.1, 0.1)
 
 

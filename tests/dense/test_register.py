@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg.config import DenseConfig
 from jaxreg.dense import register_dense
 
-pytestmark = pytest.mark.float32
+pytestmark = [pytest.mark.float32, pytest.mark.slow]
 CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=12, finalists=3)
 solve = jax.jit(
     lambda x, y, a, b: register_dense(x, y, source_mask=a, reference_mask=b, config=CONFIG)

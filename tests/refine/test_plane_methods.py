@@ -14,6 +14,8 @@ from jaxreg.refine.gicp import gicp
 from jaxreg.refine.point_to_plane import point_to_plane
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 STATIC = ("iterations", "kernel", "trim", "anneal", "both_directions", "neighbors")
 METHODS = {
     "point_to_plane": jax.jit(point_to_plane, static_argnames=STATIC),

@@ -1,0 +1,177 @@
+"""How the constants of `jaxreg/search/verdict.py` were fitted, and how well they judge.
+
+    python benchmarks/calibrate_success.py [--data-root DATA] [--pairs 150]
+
+Registers pairs whose truth is known, from procedural shapes and, where it is found, ModelNet40:
+independent samplings of one shape, with noise and with own half-space crops (overlap 0.5 to 1), pairs
+of unrelated shapes, and the two ends of one shape, which share no surface. A pose is right within 5
+degrees and 0.1 of the shape's radius. A logistic regression on half of the pairs is judged on the other.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import tyro
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from jaxreg import compilation
+from jaxreg.data import data_root, modelnet, shapes
+from jaxreg.metrics import rotation_angle_deg
+from jaxreg.register import register
+from jaxreg.search import verdict
+
+KINDS = ("full", "noisy", "crops", "unrelated", "apart")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    data_root: str | None = None
+    pairs: int = 150
+    """Pairs of each source of shapes."""
+    seed: int = 0
+    save: Path | None = None
+    """Write the evidence of every pair here (JSON)."""
+
+
+def sources(options: Options) -> dict:
+    """Functions from an index to a cloud (2048, 3) or so."""
+    found = {"procedural": lambda i: shapes.sample_shape(options.seed + 77, i, points=2048)}
+    root = data_root(options.data_root)
+    if root is not None:
+        clouds, _ = modelnet.load(root, "train")
+        order = np.random.default_rng(options.seed).permutation(len(clouds))
+        found["ModelNet40"] = lambda i: clouds[order[i]]
+    return found
+
+
+def make_pair(shape, index: int, rng: np.random.Generator):
+    """Source, reference, the true 4x4 transform (None where there is none) and the kind."""
+    kind = KINDS[index % len(KINDS)]
+    cloud = np.asarray(shape(index), np.float64)
+    cloud = cloud[rng.permutation(len(cloud))]
+    half = len(cloud) // 2
+    source, reference = cloud[:half], cloud[half:]
+    if kind == "noisy":
+        source, reference = (
+            x + np.clip(rng.normal(size=x.shape) * rng.uniform(0, 0.015), -0.05, 0.05)
+            for x in (source, reference)
+        )
+    if kind == "crops":
+        source, reference = (crop(x, rng, rng.uniform(0.6, 0.9)) for x in (source, reference))
+    if kind == "unrelated":
+        reference = np.asarray(shape(index + 7), np.float64)[half:]
+    if kind == "apart":
+        along = cloud @ (direction := rng.normal(size=3))
+        low, high = np.quantile(along, (0.45, 0.55))
+        source, reference = cloud[along < low], cloud[along > high]
+        del direction
+    turn, shift = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1, 1, 3)
+    truth = np.block([[turn, shift[:, None]], [0, 0, 0, 1]])
+    moved = (source - shift) @ turn
+    return moved, reference, None if kind in ("unrelated", "apart") else truth, kind
+
+
+def crop(points: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
+    """The points on one side of a random plane."""
+    along = points @ rng.normal(size=3)
+    return points[along >= np.quantile(along, 1 - share)]
+
+
+def run(options: Options) -> list[dict]:
+    """Register every pair; one record each."""
+    records = []
+    for name, shape in sources(options).items():
+        for index in range(options.pairs):
+            rng = np.random.default_rng((options.seed, index))
+            source, reference, truth, kind = make_pair(shape, index, rng)
+            result = register(source, reference)
+            right = False
+            if truth is not None:
+                angle = rotation_angle_deg(result.rotation, truth[:3, :3])
+                centre = source.mean(axis=0)
+                change = (result.transformation - truth)[:3]
+                right = angle < 5 and np.linalg.norm(change[:, :3] @ centre + change[:, 3]) < 0.1
+            records.append(
+                {"source": name, "kind": kind, "right": bool(right)} | result.evidence._asdict()
+            )
+            print(f"\r{name} {index + 1}/{options.pairs}", end="", flush=True)
+        print()
+    return records
+
+
+def fit(inputs: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Intercept and coefficients of a logistic regression with a weak penalty."""
+    design = np.concatenate([np.ones((len(inputs), 1)), inputs], axis=1)
+
+    def loss(weights):
+        score = design @ weights * np.where(right, 1, -1)
+        return np.sum(np.logaddexp(0, -score)) + 0.02 * np.sum(weights[1:] ** 2)
+
+    return minimize(loss, np.zeros(design.shape[1])).x
+
+
+def report(records: list[dict], weights: np.ndarray | None, title: str) -> None:
+    """The shares of wrong verdicts, by kind; `weights` None uses those of the library."""
+    print(title)
+    for kind in KINDS:
+        chosen = [r for r in records if r["kind"] == kind]
+        if not chosen:
+            continue
+        right = np.array([r["right"] for r in chosen])
+        chance = np.array([probability(r, weights) for r in chosen])
+        trusted = chance >= verdict.TRUSTED
+        missed = np.mean(~trusted[right]) if right.any() else np.nan
+        false = np.mean(trusted[~right]) if (~right).any() else np.nan
+        print(
+            f"  {kind:10s} {len(chosen):4d} pairs  right {right.mean():.2f}  "
+            f"right but called failure {missed:.3f}  wrong but called success {false:.3f}"
+        )
+    chance = np.array([probability(r, weights) for r in records])
+    right = np.array([r["right"] for r in records])
+    for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 1.01)):
+        inside = (chance >= low) & (chance < high)
+        if inside.any():
+            print(
+                f"  said {low:.1f} to {min(high, 1):.1f}: {inside.sum()} pairs, right {right[inside].mean():.2f}"
+            )
+
+
+def probability(record: dict, weights: np.ndarray | None) -> float:
+    """Of the library, or by the given weights."""
+    found = verdict.Evidence(*(record[name] for name in verdict.Evidence._fields))
+    if weights is None:
+        return verdict.probability(found)
+    return float(1 / (1 + np.exp(-(weights[0] + verdict.features(found) @ weights[1:]))))
+
+
+def main(options: Options) -> None:
+    """Run, fit on every second pair, judge on the others, and print the constants of all."""
+    compilation.enable_compilation_cache()
+    records = run(options)
+    if options.save:
+        options.save.write_text(json.dumps(records))
+    inputs = np.array(
+        [
+            verdict.features(verdict.Evidence(*(r[n] for n in verdict.Evidence._fields)))
+            for r in records
+        ]
+    )
+    right = np.array([r["right"] for r in records])
+    report(records, None, "the library's constants, all pairs")
+    odd = np.random.default_rng(options.seed).random(len(records)) < 0.5
+    held_out = [r for r, taken in zip(records, odd, strict=True) if not taken]
+    report(
+        held_out, fit(inputs[odd], right[odd]), "fitted on half of the pairs, judged on the others"
+    )
+    weights = fit(inputs, right)
+    print(f"_INTERCEPT = {weights[0]:.2f}")
+    print(f"_COEFFICIENTS = np.array([{', '.join(f'{w:.2f}' for w in weights[1:])}])")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
