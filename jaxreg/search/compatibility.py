@@ -48,7 +48,7 @@ def hypotheses(
     return poses, support
 
 
-def _compatibility(source: Array, reference: Array, mask: Array, tolerance: Array) -> Array:
+def _compatibility(source: Array, reference: Array, mask: Array, tolerance: Array | float) -> Array:
     """``max(0, 1 - (e / tolerance)^2)`` of the change e of every distance; 0 for near pairs.
 
     Points closer than the tolerance keep their distance under any motion, which proves nothing.
@@ -70,7 +70,7 @@ def _principal(matrix: Float[Array, "c c"]) -> Float[Array, "c"]:
 
 
 def _apart(
-    strength: Array, source: Array, reference: Array, distance: Array, count: int
+    strength: Array, source: Array, reference: Array, distance: Array | float, count: int
 ) -> Int[Array, "count"]:
     """The strongest correspondence again and again, without those near one taken before."""
 
@@ -84,7 +84,7 @@ def _apart(
 
 
 def _refitted(
-    poses: RigidTransform, source: Array, reference: Array, mask: Array, tolerance: Array
+    poses: RigidTransform, source: Array, reference: Array, mask: Array, tolerance: Array | float
 ) -> tuple[RigidTransform, Float[Array, "seeds"]]:
     """Poses solved again from all correspondences that they satisfy, and the sums of weights."""
 
