@@ -6,6 +6,7 @@ what has no counterpart stops pulling although no overlap was ever estimated.
 
 import jax
 import jax.numpy as jnp
+from jax.lax import Precision
 from jaxtyping import Array, Float
 
 from jaxreg import rigid
@@ -71,7 +72,8 @@ def align_fine(
         forward = nearest_packed(moved, reference.points, reference.mask)
         backward = nearest_packed(reference.points, moved, source.mask)
         i, j = jnp.concatenate([rows, backward]), jnp.concatenate([forward, columns])
-        turned = pose.rotation @ covariances @ pose.rotation.T
+        turned = jnp.matmul(pose.rotation, covariances, precision=Precision.HIGHEST)
+        turned = jnp.matmul(turned, pose.rotation.T, precision=Precision.HIGHEST)
         metric = 2 * thickness * inverse_symmetric(turned[i] + others[j])
         residual = moved[i] - reference.points[j]
         weight = jnp.where(valid, _closeness(residual, width), 0)

@@ -10,6 +10,7 @@ too, whatever cut the clouds.
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.lax import Precision
 from jaxtyping import Array, Float
 
 from jaxreg import rigid
@@ -47,7 +48,8 @@ def evidence(
     points with d between 2 and 6 `width` (0 for the others).
     """
     moved = source._replace(
-        points=rigid.apply(pose, source.points), normals=source.normals @ pose.rotation.T
+        points=rigid.apply(pose, source.points),
+        normals=jnp.matmul(source.normals, pose.rotation.T, precision=Precision.HIGHEST),
     )
     there = _one_way(moved, reference, width, plane_width, rim)
     back = _one_way(reference, moved, width, plane_width, rim)
