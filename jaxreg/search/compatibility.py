@@ -75,7 +75,7 @@ def _apart(
     """The strongest correspondence again and again, without those near one taken before."""
 
     def take(strength, _):
-        best = jnp.argmax(strength)
+        best = jnp.argmax(strength).astype(jnp.int32)
         near = jnp.sum((source - source[best]) ** 2, axis=1) < distance**2
         near &= jnp.sum((reference - reference[best]) ** 2, axis=1) < distance**2
         return jnp.where(near, -1, strength), best
