@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg import rigid
 from jaxreg.config import LossConfig, ModelConfig
-from jaxreg.invariants import included_angles
+from jaxreg.invariants import included_angles, rounding_error
 from jaxreg.model import Graph, Step
 from jaxreg.neighbors import nearest_in, without_padding
 from jaxreg.numerics import safe_norm
@@ -89,7 +89,9 @@ def geometric_consistency(
     for points in (source, copy):
         vectors = points[inliers][:, None] - points[near]
         edge = safe_norm(vectors)[..., None] if kind == "length" else vectors
-        structures.append((edge, included_angles(vectors, pairs=config.angles)))
+        negligible = rounding_error(points)
+        angles = included_angles(vectors, pairs=config.angles, negligible=negligible)
+        structures.append((edge, angles))
     for of_source, of_copy in zip(*structures, strict=True):
         total += jnp.sum(jnp.where(valid[:, None], safe_norm(of_source - of_copy), 0))
     return total

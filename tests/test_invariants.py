@@ -83,3 +83,19 @@ def test_a_single_neighbour(rng, angles):
     result = structure("vector", angles)(points, neighbors[:, :1])
     expected = oracles.geometric_structure(points, neighbors[:, :1], "vector", angles)
     np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_copies_on_one_place_up_to_rounding_make_no_angles(rng, dtype):
+    # A matching that cannot tell points apart gives all of them one copy, but for the last digit.
+    place = rng.normal(size=3).astype(dtype)
+    copies = place * (1 + np.finfo(dtype).eps * rng.integers(-3, 4, (12, 3))).astype(dtype)
+    _, neighbors = cloud(rng)
+    run = structure("length", "all")
+    np.testing.assert_array_equal(run(copies, neighbors)[..., 1:], 0)
+    gradient = jax.jit(jax.grad(lambda x, idx: run(x, idx)[..., 1:].sum()))
+    np.testing.assert_array_equal(gradient(copies, neighbors), 0)
+    # Small clouds far from the origin keep their angles as long as they have digits.
+    small = 1 + 1e-3 * rng.normal(size=(12, 3))
+    expected = oracles.geometric_structure(small, neighbors, "length", "all")
+    np.testing.assert_allclose(run(small, neighbors), expected, atol=1e-9)

@@ -9,6 +9,8 @@ from jaxreg.register import register
 from jaxreg.search import host
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 STAIRS, TABLE, CHAIR = 8, 9, 10
 
 

@@ -10,6 +10,8 @@ from jaxreg.refine.pairing import closest_pairs
 from jaxreg.refine.tree import index_cloud, padded_size, tree_pairs
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 
 def test_few_sizes_cover_all_counts():
     counts = np.arange(1, 100_000)

@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.search.compatibility import hypotheses
 
+pytestmark = [pytest.mark.slow]
+
 
 def correspondences(rng, count, right, noise=0.005):
     turn, shift = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)

@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.search.descriptors import BINS, fpfh, outward
 
+pytestmark = [pytest.mark.slow]
+
 RADIUS = 0.7
 
 

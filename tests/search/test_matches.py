@@ -6,6 +6,8 @@ import pytest
 
 from jaxreg.search.matches import match_histograms
 
+pytestmark = [pytest.mark.slow]
+
 
 def shares(rng, n):
     values = rng.random((n, 9)) ** 4

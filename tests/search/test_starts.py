@@ -9,6 +9,8 @@ from jaxreg.data import shapes
 from jaxreg.search.starts import multi_start, rotation_covering, truncated_residual
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 
 def test_no_rotation_is_far_from_the_covering(seed):
     covering = Rotation.from_matrix(rotation_covering(576)).as_quat()

@@ -8,6 +8,8 @@ from jaxreg.data import shapes
 from jaxreg.search import host, verdict
 from jaxreg.types import RigidTransform
 
+pytestmark = [pytest.mark.slow]
+
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 
