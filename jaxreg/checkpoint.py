@@ -82,10 +82,10 @@ class Run:
         path = self.directory / "metrics.jsonl"
         if path.exists():
             lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-            path.write_text(
-                "".join(line for line in lines if json.loads(line)["step"] <= step),
-                encoding="utf-8",
-            )
+            # A run that was killed while it wrote leaves half a line.
+            whole = [line for line in lines if line.endswith("}\n")]
+            kept = "".join(line for line in whole if json.loads(line)["step"] <= step)
+            path.write_text(kept, encoding="utf-8")
 
 
 @contextlib.contextmanager

@@ -382,14 +382,14 @@ def test_t20_the_order_of_the_points_plays_no_role(rng, kind):
 
 TWO_DEVICES = """
 import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxreg import knn, weighted_procrustes
 
 assert len(jax.devices()) == 2
 rng = np.random.default_rng(0)
 source, reference = rng.normal(size=(2, 4, 20, 3)).astype(np.float32)
 weights = rng.uniform(size=(4, 20)).astype(np.float32)
-mesh = jax.make_mesh((2,), ("pairs",))
+mesh = jax.make_mesh((2,), ("pairs",), axis_types=(AxisType.Auto,))
 split = NamedSharding(mesh, PartitionSpec("pairs"))
 run = jax.jit(jax.vmap(lambda x, y, w: (weighted_procrustes(x, y, w), knn(x, 3))))
 one = run(source, reference, weights)
@@ -462,6 +462,8 @@ def test_t24_killed_during_a_save(tmp_path):
     # What a resumed run then computes is compared bit by bit in the tests of training.
     done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
     assert done.returncode == -signal.SIGKILL
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 3, "lo')  # Killed while it wrote a line, too.
     with checkpoint.open_run(tmp_path, Config()) as run:
         state = run.restore({"weights": jnp.zeros((512, 512), jnp.float32)})
     values = np.unique(state["weights"])
