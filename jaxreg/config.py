@@ -208,13 +208,13 @@ class RegisterConfig:
     """Rotations that cover SO(3), for shapes whose features say little."""
     limited_deg: float = 80.0
     """Largest rotation between two clouds that `rotation = "limited"` looks for."""
-    verified: int = 6
+    verified: int = 12
     """Poses that are polished and compared before the best is refined."""
     reach: float = 1.5
     """A point agrees with the other cloud when it is within this many spacings of it."""
     doubtful: float = 0.5
-    """Disagreement (0 to 1) of the best pose from features above which the covering is tried too."""
-    refine_points: int = 8192
+    """Disagreement (0 to 1) of the best pose from features above which the dense path adds others."""
+    refine_points: int = 4096
     """Most points of a cloud in the refinement."""
     refine_iterations: int = 15
     """Most iterations of the refinement."""

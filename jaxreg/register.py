@@ -93,7 +93,7 @@ def register(
     if start is None:
         pose = _searched(*clouds, rotation, config)
     else:
-        start = RigidTransform(*(part[None] for part in scans.pose_in(frame, start)))
+        start = _stacked(scans.pose_in(frame, start))
         pose = _first(host.polished(start, *clouds[:3])) if refine else _first(start)
     refined = _refined(x, y, pose, refine, clouds[2], config)
     judged = verdict.evidence(refined.transform, *clouds[:2], config.reach * clouds[2])
@@ -133,31 +133,40 @@ def _searched(
     rotation: Rotation,
     config: RegisterConfig,
 ) -> RigidTransform:
-    """The pose on which the coarse clouds agree best, of features, and of a covering if they fail."""
+    """The pose on which the coarse clouds agree best.
+
+    Poses come from matched histograms. Where the best of them leaves a doubt, the dense path adds
+    its own; clouds of few points have no histograms, and are turned by a covering of the rotations.
+    """
     largest = 180.0 if rotation == "full" else config.limited_deg
     unmoved = scans.pose_in(frame, RigidTransform(np.eye(3), np.zeros(3)))
     pool = RigidTransform(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), unmoved.translation]))
-    enough = min(len(source.valid), len(reference.valid)) >= _FEWEST_FOR_FEATURES
-    if enough:
-        pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
-        pose, score = _best(pool, source, reference, spacing, largest, config)
-        if score < config.doubtful:
-            return pose
-    pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
-    return _best(pool, source, reference, spacing, largest, config)[0]
+    if min(len(source.valid), len(reference.valid)) < _FEWEST_FOR_FEATURES:
+        pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
+        return _best(pool, source, reference, spacing, largest, config)[0]
+    pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
+    pose, score = _best(pool, source, reference, spacing, largest, config)
+    if score < config.doubtful:
+        return pose
+    more = host.joined(_stacked(pose), host.dense_poses(source, reference))
+    return _best(more, source, reference, spacing, largest, config)[0]
 
 
 def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidTransform, float]:
     """The pose of a pool that agrees best after polishing, and its disagreement."""
-    reach = config.reach * spacing
     pool = host.turned_less(pool, largest_deg)
-    scores = host.disagreement(pool, source, reference, 2 * reach)
+    scores = host.disagreement(pool, source, reference, 3 * spacing)
     chosen = host.distinct_best(pool, scores, config.verified, apart=2 * spacing)
     chosen = host.polished(chosen, source, reference, spacing)
-    scores = host.disagreement(chosen, source, reference, reach)
+    # A narrow reach: flips of nearly symmetric shapes agree roughly, and only the truth closely.
+    scores = host.disagreement(chosen, source, reference, spacing)
     # Of poses that agree equally (a symmetric shape) the one that turns least.
     best = int(np.argmin(scores + 0.01 * host.angles(chosen) / np.pi))
     return jax.tree.map(lambda part: part[best], chosen), float(scores[best])
+
+
+def _stacked(pose: RigidTransform) -> RigidTransform:
+    return RigidTransform(*(part[None] for part in pose))
 
 
 def _first(poses: RigidTransform) -> RigidTransform:
@@ -178,8 +187,8 @@ def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> R
         initial=pose,
         iterations=config.refine_iterations if method else 1,
         max_distance=3 * finer if method else 0.0,
-        scale=0.5 * finer,
         anneal=4.0,
+        both_directions=True,
         dense_limit=0,
     )
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from jaxreg import compilation, scans
 from jaxreg.config import RegisterConfig
+from jaxreg.dense.register import search_dense
 from jaxreg.refine.normals import normals
 from jaxreg.refine.pairing import Weighting
 from jaxreg.refine.tree import IndexedCloud, iterate
@@ -28,6 +29,7 @@ _SMALLEST = 128
 _NORMAL_NEIGHBORS = 16
 _SAMPLES = 400
 """Points of each cloud that a pose is judged by."""
+_DENSE_POINTS = 1024
 _START_POINTS = 256
 _START_REACH, _START_TRIM, _START_ITERATIONS, _START_KEPT = 0.25, 0.7, 8, 16
 """The covering is coarse: 20 degrees turn a point by a third of its radius."""
@@ -148,6 +150,22 @@ def _start_poses():
     )
 
 
+def dense_poses(source: Coarse, reference: Coarse) -> RigidTransform:
+    """The finalists (leading axis) of the dense path, best first."""
+    rows = []
+    for cloud in (source, reference):
+        points = scans.reduce_to(cloud.valid, _DENSE_POINTS)
+        size = scans.bucket(len(points), smallest=_SMALLEST, largest=_DENSE_POINTS)
+        rows.append(scans.padded(points, size))
+    (x, x_mask), (y, y_mask) = rows
+    return _taken(_dense()(x, y, source_mask=x_mask, reference_mask=y_mask).poses, slice(None))
+
+
+@functools.cache
+def _dense():
+    return compilation.jit(search_dense)
+
+
 def polished(
     poses: RigidTransform, source: Coarse, reference: Coarse, spacing: float
 ) -> RigidTransform:
@@ -156,7 +174,7 @@ def polished(
         IndexedCloud(cloud.valid, cloud.tree, cloud.points, cloud.normals)
         for cloud in (source, reference)
     ]
-    weighting = Weighting("geman_mcclure", 0.5 * spacing, 4 * spacing, 1.0)
+    weighting = Weighting("geman_mcclure", None, 4 * spacing, 1.0)
     results = [
         iterate(
             _taken(poses, index),
@@ -165,7 +183,7 @@ def polished(
             _POLISH_WIDTHS,
             method="gicp",
             thickness=_POLISH_THICKNESS,
-            both_directions=False,
+            both_directions=True,
             tolerance=1e-4,
         )[0]
         for index in range(len(poses.rotation))
