@@ -3,9 +3,10 @@
     python benchmarks/calibrate_success.py [--data-root DATA] [--pairs 150]
 
 Registers pairs whose truth is known, from procedural shapes and, where it is found, ModelNet40:
-independent samplings of one shape, with noise and with own half-space crops (overlap 0.5 to 1), pairs
-of unrelated shapes, and the two ends of one shape, which share no surface. A pose is right within 5
-degrees and 0.1 of the shape's radius. A logistic regression on half of the pairs is judged on the other.
+independent samplings of one shape, with noise and with own half-space crops (overlap 0.5 to 1),
+pairs of unrelated shapes, and the two ends of one shape, which share no surface. A pose is right
+within 5 degrees and 0.1 of the shape's radius. A logistic regression on half of the pairs is judged
+on the other half.
 """
 
 import dataclasses
@@ -104,6 +105,21 @@ def run(options: Options) -> list[dict]:
     return records
 
 
+def congruent(record: dict) -> bool:
+    """Ends of one shape that fit each other like two samples of one surface, as those of a box do.
+
+    Nothing in the two clouds says that they are not; they would only teach to distrust good pairs.
+    """
+    return record["kind"] == "apart" and record["gap"] < 1.5 and record["facing"] > -0.2
+
+
+def design(records: list[dict]) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs of the regression, and which poses are right."""
+    found = [verdict.Evidence(*(r[n] for n in verdict.Evidence._fields)) for r in records]
+    inputs = np.array([verdict.features(evidence) for evidence in found])
+    return inputs, np.array([r["right"] for r in records])
+
+
 def fit(inputs: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Intercept and coefficients of a logistic regression with a weak penalty."""
     design = np.concatenate([np.ones((len(inputs), 1)), inputs], axis=1)
@@ -136,8 +152,9 @@ def report(records: list[dict], weights: np.ndarray | None, title: str) -> None:
     for low, high in ((0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 1.01)):
         inside = (chance >= low) & (chance < high)
         if inside.any():
+            share = right[inside].mean()
             print(
-                f"  said {low:.1f} to {min(high, 1):.1f}: {inside.sum()} pairs, right {right[inside].mean():.2f}"
+                f"  said {low:.1f} to {min(high, 1):.1f}: {inside.sum()} pairs, right {share:.2f}"
             )
 
 

@@ -108,6 +108,7 @@ def ransac_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def open3d_icp(clouds, initial: np.ndarray) -> np.ndarray:
+    """Point-to-plane ICP of Open3D, from a coarse pose."""
     import open3d as o3d
 
     pipelines = o3d.pipelines.registration

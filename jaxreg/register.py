@@ -90,14 +90,16 @@ def register(
     x = (moving.points - frame.source_centre) / frame.length
     y = (fixed.points - frame.reference_centre) / frame.length
     clouds = *host.coarse_pair(x, y, config), frame
+    rival = verdict.NO_RIVAL
     if start is None:
-        pose = _searched(*clouds, rotation, config)
+        pose, rival = _searched(*clouds, rotation, config)
     else:
         start = _stacked(scans.pose_in(frame, start))
         pose = _first(host.polished(start, *clouds[:3])) if refine else _first(start)
     refined = _refined(x, y, pose, refine, clouds[2], config)
-    judged = verdict.evidence(refined.transform, *clouds[:2], config.reach * clouds[2])
-    return _result(x, y, moving, fixed, frame, refined, judged, config.reach * clouds[2], begin)
+    reach = config.reach * clouds[2]
+    judged = verdict.evidence(refined.transform, *clouds[:2], reach, rival=rival)
+    return _result(x, y, moving, fixed, frame, refined, judged, reach, begin)
 
 
 def _check_options(rotation: str, refine: str | None) -> None:
@@ -132,8 +134,8 @@ def _searched(
     frame: scans.Frame,
     rotation: Rotation,
     config: RegisterConfig,
-) -> RigidTransform:
-    """The pose on which the coarse clouds agree best.
+) -> tuple[RigidTransform, float]:
+    """The pose on which the coarse clouds agree best, and how much worse the next best agrees.
 
     Poses come from matched histograms. Where the best of them leaves a doubt, the dense path adds
     its own; clouds of few points have no histograms, and are turned by a covering of the rotations.
@@ -143,17 +145,19 @@ def _searched(
     pool = RigidTransform(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), unmoved.translation]))
     if min(len(source.valid), len(reference.valid)) < _FEWEST_FOR_FEATURES:
         pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
-        return _best(pool, source, reference, spacing, largest, config)[0]
+        return _best(pool, source, reference, spacing, largest, config)[:2]
     pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
-    pose, score = _best(pool, source, reference, spacing, largest, config)
+    pose, rival, score = _best(pool, source, reference, spacing, largest, config)
     if score < config.doubtful:
-        return pose
+        return pose, rival
     more = host.joined(_stacked(pose), host.dense_poses(source, reference))
-    return _best(more, source, reference, spacing, largest, config)[0]
+    return _best(more, source, reference, spacing, largest, config)[:2]
 
 
-def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidTransform, float]:
-    """The pose of a pool that agrees best after polishing, and its disagreement."""
+def _best(
+    pool, source, reference, spacing, largest_deg, config
+) -> tuple[RigidTransform, float, float]:
+    """The pose of a pool that agrees best after polishing, the lead over others, its disagreement."""
     pool = host.turned_less(pool, largest_deg)
     scores = host.disagreement(pool, source, reference, 3 * spacing)
     chosen = host.distinct_best(pool, scores, config.verified, apart=2 * spacing)
@@ -162,7 +166,9 @@ def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidT
     scores = host.disagreement(chosen, source, reference, spacing)
     # Of poses that agree equally (a symmetric shape) the one that turns least.
     best = int(np.argmin(scores + 0.01 * host.angles(chosen) / np.pi))
-    return jax.tree.map(lambda part: part[best], chosen), float(scores[best])
+    others = host.differs(chosen, best)
+    lead = scores[others].min() - scores[best] if others.any() else verdict.NO_RIVAL
+    return jax.tree.map(lambda part: part[best], chosen), float(lead), float(scores[best])
 
 
 def _stacked(pose: RigidTransform) -> RigidTransform:

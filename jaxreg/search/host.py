@@ -238,3 +238,10 @@ def angles(poses: RigidTransform) -> Float[np.ndarray, "p"]:
 def turned_less(poses: RigidTransform, largest_deg: float) -> RigidTransform:
     """The poses whose rotation angle is at most `largest_deg`; the identity always is."""
     return _taken(poses, angles(poses) <= np.radians(largest_deg) + 1e-6)
+
+
+def differs(poses: RigidTransform, index: int) -> Bool[np.ndarray, "p"]:
+    """Which poses turn by over 15 degrees from that at `index`, or lie a fifth of a radius from it."""
+    chord = np.linalg.norm(poses.rotation - poses.rotation[index], axis=(1, 2)) / np.sqrt(8)
+    apart = np.linalg.norm(poses.translation - poses.translation[index], axis=1)
+    return (2 * np.arcsin(np.minimum(chord, 1)) > np.radians(15)) | (apart > 0.2)

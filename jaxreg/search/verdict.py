@@ -10,27 +10,32 @@ from jaxreg.types import RigidTransform
 
 TRUSTED = 0.5
 """Probability from which a registration counts as a success."""
-_PARALLEL = 0.9
-"""Normals within 26 degrees of each other agree."""
+NO_RIVAL = 0.2
+"""Where no other pose was looked for, or none was found that differs."""
 
 
 class Evidence(NamedTuple):
     """What tells a right pose from a wrong one; plain numbers without unit.
 
     `overlap` is the share of the points of both clouds within reach of the other cloud, `smaller`
-    that of the cloud with the smaller share. `flatness` is the median distance of such points to the
-    plane of their partner, in reaches; `parallel` the share of them whose normals agree.
-    `constraint` is the smallest mean square change of those distances by a unit motion.
+    that of the cloud with the smaller share. `gap` is the median distance of such points from the
+    plane of their partner, and `facing` the mean cosine of the two normals, each compared to what
+    neighbours within one cloud show: 1 and 0 when the clouds are samples of one surface.
+    `constraint` is the smallest mean square change of those distances by a unit motion. `rival` is
+    how much worse, in shares of the points, the best other pose agrees.
     """
 
     overlap: float
     smaller: float
-    flatness: float
-    parallel: float
+    gap: float
+    facing: float
     constraint: float
+    rival: float
 
 
-def evidence(pose: RigidTransform, source: Coarse, reference: Coarse, reach: float) -> Evidence:
+def evidence(
+    pose: RigidTransform, source: Coarse, reference: Coarse, reach: float, *, rival: float
+) -> Evidence:
     """The evidence for one pose, from every point of both coarse clouds."""
     rotation, translation = pose
     x, y = source.valid, reference.valid
@@ -40,25 +45,41 @@ def evidence(pose: RigidTransform, source: Coarse, reference: Coarse, reach: flo
     other_distance, other_index = source.tree.query(back, workers=-1)
     near, other_near = distance < reach, other_distance < reach
     shares = near.mean(), other_near.mean()
-    across = np.concatenate(
-        [
-            np.abs(np.sum((moved - y[index]) * y_normals[index], axis=1))[near],
-            np.abs(np.sum((y - moved[other_index]) * x_normals[other_index], axis=1))[other_near],
-        ]
-    )
-    cosine = np.concatenate(
-        [
-            np.abs(np.sum(x_normals * y_normals[index], axis=1))[near],
-            np.abs(np.sum(y_normals * x_normals[other_index], axis=1))[other_near],
-        ]
+    there = _beside(moved[near], y[index[near]], x_normals[near], y_normals[index[near]])
+    back = _beside(
+        y[other_near], moved[other_index[other_near]],
+        y_normals[other_near], x_normals[other_index[other_near]],
+    )  # fmt: skip
+    across, cosine = (np.concatenate(parts) for parts in zip(there, back, strict=True))
+    own_across, own_cosine = (
+        np.concatenate(parts) for parts in zip(_own(source), _own(reference), strict=True)
     )
     return Evidence(
         overlap=float(np.mean(np.concatenate([near, other_near]))),
         smaller=float(min(shares)),
-        flatness=float(np.median(across) / reach) if len(across) else 1.0,
-        parallel=float(np.mean(cosine > _PARALLEL)) if len(cosine) else 0.0,
+        gap=_median(across, reach) / max(_median(own_across, reach), 0.01 * reach),
+        facing=float(np.mean(cosine) - np.mean(own_cosine)) if len(cosine) else -1.0,
         constraint=_constraint(moved[near], y_normals[index][near]),
+        rival=float(rival),
     )
+
+
+def _beside(x: np.ndarray, y: np.ndarray, x_normals: np.ndarray, y_normals: np.ndarray):
+    """Distances of points from their partners' planes, and cosines of the normals."""
+    across = np.abs(np.sum((x - y) * y_normals, axis=1))
+    return across, np.abs(np.sum(x_normals * y_normals, axis=1))
+
+
+def _own(cloud: Coarse):
+    """The same between every point and its nearest neighbour in its own cloud."""
+    count = len(cloud.valid)
+    index = cloud.neighbors[:count, 0]
+    normals = cloud.normals[:count]
+    return _beside(cloud.valid, cloud.valid[index], normals, normals[index])
+
+
+def _median(values: np.ndarray, default: float) -> float:
+    return float(np.median(values)) if len(values) else default
 
 
 def _constraint(points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]) -> float:
@@ -79,19 +100,20 @@ def probability(found: Evidence) -> float:
     return float(1 / (1 + np.exp(-np.clip(_INTERCEPT + inputs @ _COEFFICIENTS, -50, 50))))
 
 
-def features(found: Evidence) -> Float[np.ndarray, "5"]:
-    """The inputs of the regression; small constraints are told apart by their logarithm."""
+def features(found: Evidence) -> Float[np.ndarray, "6"]:
+    """The inputs of the regression; quantities that span decades by their logarithm."""
     return np.array(
         [
             found.overlap,
             found.smaller,
-            found.flatness,
-            found.parallel,
+            np.log(max(found.gap, 0.1)),
+            found.facing,
             np.log10(max(found.constraint, 1e-6)),
+            np.log10(max(found.rival, 0) + 0.003),
         ]
     )
 
 
-_INTERCEPT = -4.0
-_COEFFICIENTS = np.array([4.0, 4.0, -6.0, 4.0, 0.0])
+_INTERCEPT = 7.82
+_COEFFICIENTS = np.array([2.07, 1.5, -3.9, 7.33, 2.57, 4.07])
 """To be fitted by benchmarks/calibrate_success.py."""

@@ -21,20 +21,24 @@ def clouds():
 
 def test_right_pose_is_trusted_and_a_wrong_one_is_not(clouds):
     source, reference, spacing = clouds
-    right = verdict.evidence(IDENTITY, source, reference, 1.5 * spacing)
+    right = verdict.evidence(IDENTITY, source, reference, 1.5 * spacing, rival=0.2)
     wrong = verdict.evidence(
-        RigidTransform(np.eye(3), np.array([0.3, 0.2, 0.1])), source, reference, 1.5 * spacing
+        RigidTransform(np.eye(3), np.array([0.3, 0.2, 0.1])),
+        source,
+        reference,
+        1.5 * spacing,
+        rival=0.2,
     )
     assert right.overlap > 0.95
-    assert right.flatness < wrong.flatness
-    assert right.parallel > wrong.parallel
+    assert right.gap < wrong.gap
+    assert right.facing > wrong.facing
     assert verdict.probability(right) > verdict.TRUSTED > verdict.probability(wrong)
 
 
 def test_far_clouds_give_finite_evidence(clouds):
     source, reference, spacing = clouds
     far = RigidTransform(np.eye(3), np.full(3, 100.0))
-    found = verdict.evidence(far, source, reference, spacing)
+    found = verdict.evidence(far, source, reference, spacing, rival=0.0)
     assert np.isfinite(found).all()
     assert found.overlap == 0
     assert verdict.probability(found) < 0.05
@@ -47,6 +51,6 @@ def test_constraint_is_small_for_a_plane_and_large_for_a_corner(seed):
     found = []
     for cloud in (plane, corner):
         a, b, spacing = host.coarse_pair(cloud, cloud, RegisterConfig())
-        found.append(verdict.evidence(IDENTITY, a, b, spacing).constraint)
+        found.append(verdict.evidence(IDENTITY, a, b, spacing, rival=0.2).constraint)
     assert found[0] < 1e-6
     assert found[1] > 0.01
