@@ -80,11 +80,8 @@ def iterate(
             converged = _change(pose, new) < tolerance
             pose, taken = new, taken + 1
             # At least to the next width; at the last width a converged loop ends.
-            i = (
-                min((i + len(widths)) // 2, len(widths) - 1)
-                if converged and widths[i] != 1
-                else i + 1
-            )
+            halfway = min((i + len(widths)) // 2, len(widths) - 1)
+            i = max(i + 1, halfway) if converged and widths[i] != 1 else i + 1
     return pose, taken, converged, pairs
 
 
