@@ -212,8 +212,8 @@ class RegisterConfig:
     """Poses that are polished and compared before the best is refined."""
     reach: float = 1.5
     """A point agrees with the other cloud when it is within this many spacings of it."""
-    doubtful: float = 0.5
-    """Disagreement (0 to 1) of the best pose from features above which the dense path adds others."""
+    convincing: float = 0.9
+    """Probability of the best pose from features below which the dense path adds its poses."""
     refine_points: int = 4096
     """Most points of a cloud in the refinement."""
     refine_iterations: int = 15

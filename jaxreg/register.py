@@ -145,13 +145,14 @@ def _searched(
     pool = RigidTransform(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), unmoved.translation]))
     if min(len(source.valid), len(reference.valid)) < _FEWEST_FOR_FEATURES:
         pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
-        return _best(pool, source, reference, spacing, largest, config)[:2]
+        return _best(pool, source, reference, spacing, largest, config)
     pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
-    pose, rival, score = _best(pool, source, reference, spacing, largest, config)
-    if score < config.doubtful:
-        return pose, rival
+    pose, lead = _best(pool, source, reference, spacing, largest, config)
+    found = verdict.evidence(pose, source, reference, config.reach * spacing, rival=lead)
+    if verdict.probability(found) > config.convincing:
+        return pose, lead
     more = host.joined(_stacked(pose), host.dense_poses(source, reference))
-    return _best(more, source, reference, spacing, largest, config)[:2]
+    return _best(more, source, reference, spacing, largest, config)
 
 
 def _best(
@@ -168,7 +169,7 @@ def _best(
     best = int(np.argmin(scores + 0.01 * host.angles(chosen) / np.pi))
     others = host.differs(chosen, best)
     lead = scores[others].min() - scores[best] if others.any() else verdict.NO_RIVAL
-    return jax.tree.map(lambda part: part[best], chosen), float(lead), float(scores[best])
+    return jax.tree.map(lambda part: part[best], chosen), float(lead)
 
 
 def _stacked(pose: RigidTransform) -> RigidTransform:

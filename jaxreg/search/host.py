@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 from jaxreg import compilation, scans
 from jaxreg.config import RegisterConfig
 from jaxreg.dense.register import search_dense
-from jaxreg.refine.normals import normals
-from jaxreg.refine.pairing import Weighting
-from jaxreg.refine.tree import IndexedCloud, iterate
+from jaxreg.refine.gicp import gicp_step
+from jaxreg.refine.normals import normals, plane_covariances
+from jaxreg.refine.pairing import Pairs, Weighting
 from jaxreg.search import starts
 from jaxreg.search.compatibility import hypotheses
 from jaxreg.search.descriptors import fpfh, outward
@@ -34,6 +34,7 @@ _START_POINTS = 256
 _START_REACH, _START_TRIM, _START_ITERATIONS, _START_KEPT = 0.25, 0.7, 8, 16
 """The covering is coarse: 20 degrees turn a point by a third of its radius."""
 _POLISH_WIDTHS = np.geomspace(4, 1, 8).astype(np.float32)
+_POLISHED, _POLISH_SAMPLES = 12, 512
 _POLISH_THICKNESS = 0.05
 """Coarse points are means over voxels, which lie off a curved surface."""
 
@@ -169,26 +170,63 @@ def _dense():
 def polished(
     poses: RigidTransform, source: Coarse, reference: Coarse, spacing: float
 ) -> RigidTransform:
-    """Every pose after a few robust steps of generalised ICP on the coarse clouds."""
-    clouds = [
-        IndexedCloud(cloud.valid, cloud.tree, cloud.points, cloud.normals)
-        for cloud in (source, reference)
-    ]
-    weighting = Weighting("geman_mcclure", None, 4 * spacing, 1.0)
-    results = [
-        iterate(
-            _taken(poses, index),
-            *clouds,
-            weighting,
-            _POLISH_WIDTHS,
-            method="gicp",
-            thickness=_POLISH_THICKNESS,
-            both_directions=True,
-            tolerance=1e-4,
-        )[0]
-        for index in range(len(poses.rotation))
-    ]
-    return RigidTransform(*(np.stack(parts) for parts in zip(*results, strict=True)))
+    """Every pose after a few robust steps of generalised ICP on samples, all poses at once."""
+    count = len(poses.rotation)
+    # One more size of the leading axis would be one more compilation.
+    poses = _taken(poses, np.minimum(np.arange(max(count, _POLISHED)), count - 1))
+    rows = [_sample(cloud, _POLISH_SAMPLES) for cloud in (source, reference)]
+    for width in _POLISH_WIDTHS:
+        pairs = _nearest_pairs(poses, source, reference, *rows)
+        poses = _polish_step()(
+            RigidTransform(*(part.astype(np.float32) for part in poses)),
+            (source.points, source.normals),
+            (reference.points, reference.normals),
+            pairs,
+            np.float32(4 * spacing),
+            width,
+        )
+        poses = _taken(poses, slice(None))
+    return _taken(poses, slice(count))
+
+
+def _sample(cloud: Coarse, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows spread over the cloud, filled up to `size`, and the mask of those that count."""
+    count = len(cloud.valid)
+    rows = np.linspace(0, count - 1, min(size, count)).round().astype(np.int32)
+    return np.resize(rows, size), np.arange(size) < count
+
+
+def _nearest_pairs(poses, source: Coarse, reference: Coarse, source_rows, reference_rows) -> Pairs:
+    """Sampled points with their nearest in the other cloud, both ways, for every pose."""
+    (rows, mask), (other_rows, other_mask) = source_rows, reference_rows
+    moved = np.einsum("pij,nj->pni", poses.rotation, source.valid[rows])
+    _, index = reference.tree.query(moved + poses.translation[:, None], workers=-1)
+    back = reference.valid[other_rows][None] - poses.translation[:, None]
+    _, other_index = source.tree.query(np.einsum("pji,pnj->pni", poses.rotation, back), workers=-1)
+    rows, other_rows = (np.broadcast_to(r, index.shape) for r in (rows, other_rows))
+    mask = np.broadcast_to(np.concatenate([mask, other_mask]), (len(index), 2 * len(mask)))
+    return Pairs(
+        np.concatenate([rows, other_index], axis=1).astype(np.int32),
+        np.concatenate([index, other_rows], axis=1).astype(np.int32),
+        mask,
+    )
+
+
+@functools.cache
+def _polish_step():
+    def run(poses, source, reference, pairs, max_distance, width):
+        (x, x_normals), (y, y_normals) = source, reference
+        covariances = [plane_covariances(n, _POLISH_THICKNESS) for n in (x_normals, y_normals)]
+        weighting = Weighting("geman_mcclure", None, max_distance, 1.0)
+
+        def step(pose, pairs):
+            return gicp_step(
+                pose, x, y, *covariances, pairs, weighting, width, thickness=_POLISH_THICKNESS
+            )
+
+        return jax.vmap(step)(poses, pairs)
+
+    return compilation.jit(run)
 
 
 def disagreement(
