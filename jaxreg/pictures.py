@@ -137,16 +137,21 @@ def plot_curves(metrics: str | Path, path: str | Path) -> None:
     Raises:
       ValueError: as `read_metrics`.
     """
-    columns = read_metrics(metrics)
+    _curves(read_metrics(metrics)).savefig(path, dpi=150, facecolor="white")
+
+
+def _curves(columns: dict[str, np.ndarray]) -> Figure:
+    columns = dict(columns)
     steps = columns.pop("step")
     validation = {name: columns.pop(name) for name in list(columns) if name.startswith("val_")}
     columns.pop("gradient_norm", None)
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
+    # A line through one point is nothing to see.
+    marker = "." if len(steps) < 10 else ""
     for name, values in columns.items():
-        left.plot(
-            *_binned(steps, values), label=name.replace("_", " "), lw=2 if name == "loss" else 1
-        )
+        width = 2 if name == "loss" else 1
+        left.plot(*_binned(steps, values), marker=marker, label=name.replace("_", " "), lw=width)
     # A mean surprise below zero (the entries of G can exceed 1) has no place on a logarithmic axis.
     left.set(title="training loss and its terms", xlabel="step")
     left.set_yscale("symlog", linthresh=1e-2)
@@ -158,14 +163,14 @@ def plot_curves(metrics: str | Path, path: str | Path) -> None:
         best = int(np.nanargmin(validation["val_mie_r_deg"]))
         error = validation["val_mie_r_deg"][best]
         label = f"best: {error:.3g} deg at step {steps[best]:.0f}"
-        right.plot(steps[best], error, "*", ms=14, color="black", label=label)
+        right.plot(steps[best], error, "*", ms=14, color="black", mfc="none", label=label)
     right.set(title="validation rotation error (deg)", xlabel="step", yscale="log")
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.lines:
             axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.savefig(path, dpi=150, facecolor="white")
+    return figure
 
 
 def _binned(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

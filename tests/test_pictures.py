@@ -1,6 +1,7 @@
 """Pictures are read back: the right colours stand in the right panels."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_title_states_the_errors_or_the_motion(pair):
 
 
 @pytest.mark.parametrize("steps", [1, 5, 1001])
-def test_curves_of_any_run_can_be_drawn(tmp_path, steps):
+def test_every_curve_of_any_run_is_in_sight(tmp_path, steps):
     with (tmp_path / "metrics.jsonl").open("w") as file:
         for step in range(1, steps + 1):
             entry = {"step": step, "loss": 1 / step, "gradient_norm": 1.0, "spatial_consistency": 2}
@@ -76,7 +77,34 @@ def test_curves_of_any_run_can_be_drawn(tmp_path, steps):
                 entry["val_mie_r_deg"] = 1 / step
             file.write(json.dumps(entry) + "\n")
     pictures.plot_curves(tmp_path / "metrics.jsonl", tmp_path / "curves.png")
-    assert imread(tmp_path / "curves.png").shape == (600, 1650, 4)
+    image = imread(tmp_path / "curves.png")
+
+    figure = pictures._curves(pictures.read_metrics(tmp_path / "metrics.jsonl"))
+    figure.dpi = 150
+    figure.draw_without_rendering()
+    assert image.shape[1::-1] == tuple(figure.bbox.size)
+    curves = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+    expected = {"loss", "spatial consistency"}
+    if steps >= 5:
+        expected |= {"mean angle, MIE(R)", f"best: {1 / (steps // 5 * 5):.3g} deg at step "}
+    assert {re.sub(r"(?<=step )\d+$", "", name) for name in curves} == expected
+    for line in curves.values():
+        assert 1 <= len(line.get_xdata()) <= 400
+        assert share(crop(image, line.axes.bbox), line.get_color()) > 0, line.get_label()
+    for axes in (axes for axes in figure.axes if axes.lines):
+        legend = axes.get_legend()
+        assert [text.get_text() for text in legend.get_texts()] == [
+            x.get_label() for x in axes.lines
+        ]
+        box = legend.get_window_extent()
+        assert box.x0 >= axes.bbox.x1, "the legend hides no curve"
+        assert box.x1 <= figure.bbox.x1, "the legend is not cut off"
+
+
+def crop(image, box):
+    """The part of a picture, first row on top, that a box counted from below encloses."""
+    height = len(image)
+    return image[round(height - box.y1) : round(height - box.y0), round(box.x0) : round(box.x1)]
 
 
 def test_read_metrics_gives_columns_with_gaps(tmp_path):
