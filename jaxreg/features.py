@@ -20,7 +20,8 @@ class BatchNorm(nn.Module):
     """Batch normalisation over all valid points of all clouds of a batch.
 
     While training, statistics run over the leading axes and over the `vmap` axis `BATCH_AXIS`;
-    padding does not count. At evaluation running means are used and no batch axis is needed.
+    padding does not count, and every point counts the same whatever the size of its cloud. At
+    evaluation running means are used and no batch axis is needed.
     """
 
     momentum: float
@@ -29,14 +30,53 @@ class BatchNorm(nn.Module):
     def __call__(
         self, x: Float[Array, "*points c"], mask: Bool[Array, "*#points"], *, train: bool
     ) -> Float[Array, "*points c"]:
-        normalize = nn.BatchNorm(
-            use_running_average=not train,
-            momentum=self.momentum,
-            # E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
-            use_fast_variance=False,
-            axis_name=BATCH_AXIS if train else None,
+        return _Normalize(self.momentum, name="BatchNorm_0")(x, mask, train=train)
+
+
+class _Normalize(nn.Module):
+    """``(x - mean) / sqrt(var + epsilon) * scale + bias``, the variables named as Flax names them.
+
+    Flax's own takes the mean over the clouds of the mean over each cloud, which weighs a point by
+    the size of its cloud.
+    """
+
+    momentum: float
+    epsilon: float = 1e-5
+
+    @nn.compact
+    def __call__(self, x, mask, *, train: bool):
+        scale, bias = (
+            self.param(name, getattr(nn.initializers, kind), x.shape[-1:])
+            for name, kind in (("scale", "ones"), ("bias", "zeros"))
         )
-        return normalize(x, mask=mask[..., None] if train else None)
+        mean, var = (
+            self.variable("batch_stats", name, kind, x.shape[-1:])
+            for name, kind in (("mean", jnp.zeros), ("var", jnp.ones))
+        )
+        statistics = mean.value, var.value
+        if train:
+            x = jnp.where(mask[..., None], x, 0)
+            statistics = _statistics(x, mask)
+            for running, batch in zip((mean, var), statistics, strict=True):
+                batch = batch.astype(running.value.dtype)
+                running.value = self.momentum * running.value + (1 - self.momentum) * batch
+        factor = jax.lax.rsqrt(statistics[1] + self.epsilon) * scale
+        return (x - statistics[0]) * factor + bias
+
+
+def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
+    """Mean and variance of every channel over the valid points of the whole batch."""
+    axes = tuple(range(x.ndim - 1))
+
+    def over_batch(values):
+        return jax.lax.psum(jnp.sum(values, axes), BATCH_AXIS)
+
+    valid = jnp.broadcast_to(mask, x.shape[:-1])
+    count = jnp.maximum(over_batch(valid.astype(x.dtype)), 1)
+    mean = over_batch(x) / count
+    # Two passes: E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
+    deviation = jnp.where(valid[..., None], x - mean, 0)
+    return mean, over_batch(deviation * deviation) / count
 
 
 class DGCNN(nn.Module):

@@ -88,7 +88,6 @@ def test_relative_coordinates_point_from_the_centre_to_the_neighbour(rng):
             np.testing.assert_allclose(result[i, r], points[j] - points[i], atol=1e-15)
 
 
-@pytest.mark.xfail(reason="Flax weighs clouds, not points: it averages the means of the clouds")
 def test_batch_statistics_run_over_all_valid_points_of_all_clouds(rng):
     module = BatchNorm(momentum=0.9)
     x, mask = rng.normal(3, 2, (4, 10, 5)), rng.uniform(size=(4, 10)) < 0.7
