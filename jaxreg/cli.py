@@ -6,7 +6,6 @@ Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted.
 import contextlib
 import dataclasses
 import json
-import sys
 import webbrowser
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,14 +19,29 @@ from jaxreg.config import RegisterConfig
 
 SUCCESS, BAD_INPUT, NOT_TRUSTED = 0, 2, 3
 
-_out, _err = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False)
+_CACHE_MISS = "/jax/compilation_cache/cache_misses"
+_COMPILING = (
+    "compiling for clouds of these sizes, about 10 s; the programs are kept in\n"
+    "{directory}, so that later runs need not."
+)
+_HINT = "look at it with --html PAGE.html; a rough pose to start from helps: --initial T.txt"
 
-Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+
+def _path(**options):
+    """An optional path; its default is not worth a word of the help."""
+    return tyro.conf.arg(metavar="PATH", help_behavior_hint="", **options)
+
+
+OptionalPath = Annotated[Path | None, _path()]
+Output = Annotated[Path | None, _path(aliases=["-o"])]
 
 
 @dataclasses.dataclass(frozen=True)
 class Register:
-    """Lay one scan on another, say how far the result can be trusted, and write what is asked for."""
+    """Lay one scan on another, say how far the result can be trusted, and write what is asked for.
+
+    Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted.
+    """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
     """Cloud that moves: PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
@@ -35,13 +49,13 @@ class Register:
     """Cloud that stays."""
     output: Output = None
     """Write the aligned source here (PLY keeps colours and other properties)."""
-    json: Path | None = None
-    """Write transform, figures and verdict here."""
-    plot: Path | None = None
-    """Draw before and after from two sides here (PNG)."""
-    html: Path | None = None
+    json: OptionalPath = None
+    """Write transform, figures and verdict here (JSON)."""
+    plot: OptionalPath = None
+    """Draw before and after from two sides here (PNG, PDF or SVG)."""
+    html: OptionalPath = None
     """Write a page with both clouds to turn here; it needs no network."""
-    initial: Path | None = None
+    initial: OptionalPath = None
     """Start from this 4x4 matrix (text, NPY, or the JSON of an earlier run)."""
     rotation: Literal["full", "limited"] = "full"
     """How far the clouds may be turned: by anything, or by less than about 80 degrees."""
@@ -58,57 +72,51 @@ class Info:
     """Describe a cloud: number of points, extent, spacing, defects."""
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
     """Write a page with clouds to turn; it needs no network."""
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("view.html")
+    files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE...")]
+    """Clouds in one frame."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("view.html")
     """The page."""
     open: bool = False
     """Open it in the browser."""
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """The console script `jaxreg`; ends the process with the exit status."""
-    commands = {"register": Register, "info": Info, "view": View}
+def main(arguments: list[str] | None = None) -> int:
+    """The console script `jaxreg`; returns the exit status."""
     command = tyro.extras.subcommand_cli_from_dict(
-        {name: _identity_of(kind) for name, kind in commands.items()},
+        {"register": Register, "info": Info, "view": View},
         prog="jaxreg",
         description="Rigid registration of point clouds.",
         args=arguments,
     )
     run = {Register: register_files, Info: describe_file, View: view_files}[type(command)]
     try:
-        status = run(command)
+        return run(command)
     except ValueError as error:
-        _err.print(f"error: {error}", markup=False, soft_wrap=True)
-        status = BAD_INPUT
-    raise SystemExit(status)
-
-
-def _identity_of(kind: type):
-    return kind
+        message = str(error)
+    except OSError as error:
+        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"error: {message}", markup=False)
+    return BAD_INPUT
 
 
 def register_files(command: Register) -> int:
     """`jaxreg register`."""
-    from jaxreg import io, scans, viewer
+    from jaxreg import summary
+    from jaxreg.register import register
 
-    for path in filter(None, (command.json, command.plot, command.html)):
-        if not path.parent.is_dir():
-            raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
-    if command.output:
-        io.check_writable(command.output)
+    _check_outputs(command)
     initial = read_matrix(command.initial) if command.initial else None
-    source, reference = (_read(path) for path in (command.source, command.reference))
-    for path, points in ((command.source, source), (command.reference, reference)):
-        scans.check_points(points, str(path), nonfinite=command.nonfinite)
-    with _compiling():
-        from jaxreg.register import register
-
+    source, reference = (
+        _checked(path, command.nonfinite) for path in (command.source, command.reference)
+    )
+    with _patience():
         result = register(
             source,
             reference,
@@ -118,18 +126,54 @@ def register_files(command: Register) -> int:
             nonfinite=command.nonfinite,
             config=command.config,
         )
-    for path, points in ((command.source, source), (command.reference, reference)):
-        _line(path.name, f"{len(points):,} points")
-    for name, value in viewer.figures(result).items():
+    _line("source", f"{command.source} ({len(source):,} points)")
+    _line("reference", f"{command.reference} ({len(reference):,} points)")
+    for name, value in summary.figures(result).items():
         _line(name, value.replace("\n", "; "))
-    _out.print("transformation (source to reference)", matrix_text(result.transformation), sep="\n")
-    _line("verdict", viewer.verdict_line(result))
+    _print("transformation (source to reference)")
+    _print(summary.matrix_text(result.transformation))
+    _line("verdict", summary.verdict_line(result))
     _write_results(command, source, reference, result)
+    if not result.success:
+        _line("hint", _HINT)
     return SUCCESS if result.success else NOT_TRUSTED
 
 
+def _check_outputs(command: Register) -> None:
+    """What cannot be written is said before the work, not after it."""
+    from jaxreg import io
+
+    if command.output:
+        io.check_writable(command.output)
+    if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
+    for path in filter(None, (command.json, command.plot, command.html)):
+        _check_folder(path)
+
+
+def _check_folder(path: Path) -> None:
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
+
+
+def _checked(path: Path, nonfinite: str) -> np.ndarray:
+    """The points of a file that `register` will accept."""
+    from jaxreg import io, scans
+
+    points = io.read_cloud(path)
+    finite = np.isfinite(points).all(axis=1)
+    if nonfinite == "raise" and not finite.all():
+        row = int(np.argmin(finite))
+        raise ValueError(
+            f"{path}: {np.sum(~finite):,} of {len(points):,} points are not finite, the first is "
+            f"point {row}: remove them, or give --nonfinite drop."
+        )
+    scans.check_points(points, str(path), nonfinite="drop")
+    return points
+
+
 def _write_results(command: Register, source, reference, result) -> None:
-    from jaxreg import io, viewer
+    from jaxreg import io, summary, viewer
 
     if command.output:
         if command.output.suffix.lower() == command.source.suffix.lower() == ".ply":
@@ -137,9 +181,11 @@ def _write_results(command: Register, source, reference, result) -> None:
         else:
             io.write_cloud(command.output, source @ result.rotation.T + result.translation)
     if command.json:
-        command.json.write_text(json.dumps(_summary(command, result), indent=1) + "\n", "utf-8")
+        files = {"source": str(command.source), "reference": str(command.reference)}
+        content = json.dumps(files | summary.record(result), indent=1, allow_nan=False)
+        command.json.write_text(content + "\n", "utf-8")
     if command.plot:
-        _draw(command.plot, source, reference, result)
+        viewer.draw_registration(command.plot, source, reference, result)
     if command.html:
         names = (command.source.name, command.reference.name)
         viewer.write_registration_page(command.html, source, reference, result, names=names)
@@ -147,53 +193,21 @@ def _write_results(command: Register, source, reference, result) -> None:
         _line("wrote", str(path))
 
 
-def _summary(command: Register, result) -> dict:
-    """The record without its rows per point, for machines."""
-    values = result._asdict()
-    confidence = values.pop("confidence")
-    values.pop("correspondences")
-    values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
-    files = {"source": str(command.source), "reference": str(command.reference)}
-    return files | values | {"mean_confidence": float(np.mean(confidence))}
-
-
-def _draw(path: Path, source, reference, result) -> None:
-    from jaxreg import viewer
-    from jaxreg.pictures import plot_pair
-    from jaxreg.types import RigidTransform
-
-    rows = viewer.shown_rows(source)
-    moving, fixed = source[rows], reference[viewer.shown_rows(reference)]
-    shift = viewer.brought_near(moving, fixed)
-    title = viewer.verdict_line(result)
-    if shift.any():
-        title += "; before: source brought near"
-    plot_pair(
-        moving + shift,
-        fixed,
-        RigidTransform(result.rotation, result.translation - result.rotation @ shift),
-        path,
-        confidence=result.confidence[rows],
-        title=title,
-    )
-
-
 def describe_file(command: Info) -> int:
     """`jaxreg info`."""
-    from jaxreg import scans
+    from jaxreg import io, scans
 
-    points = _read(command.file)
+    points = io.read_cloud(command.file)
     finite = np.isfinite(points).all(axis=1)
-    _line(str(command.file), f"{len(points):,} points")
+    _line("file", f"{command.file}")
+    _line("points", f"{len(points):,}")
     if not finite.all():
-        _line("not finite", f"{np.sum(~finite):,} points, the first in row {np.argmin(finite)}")
-    points = points[finite]
-    if len(points) == 0:
-        raise ValueError(f"{command.file}: no point is finite: export the file again.")
+        _line("not finite", f"{np.sum(~finite):,} points, the first is point {np.argmin(finite)}")
+    points = _finite(points, command.file)
     low, high = points.min(axis=0), points.max(axis=0)
     for axis, a, b in zip("xyz", low, high, strict=True):
-        _line(axis, f"{a:.6g} to {b:.6g} (extent {b - a:.4g})")
-    distinct = scans.make_scan(points, str(command.file)).points if len(points) >= 3 else points
+        _line(axis, f"{a:.9g} to {b:.9g} (extent {b - a:.4g})")
+    distinct = np.unique(points, axis=0)
     _line("repeated", f"{len(points) - len(distinct):,} points")
     _line("spacing", f"{scans.spacing(distinct - distinct.mean(axis=0)):.4g}")
     return SUCCESS
@@ -201,17 +215,24 @@ def describe_file(command: Info) -> int:
 
 def view_files(command: View) -> int:
     """`jaxreg view`."""
-    from jaxreg import viewer
+    from jaxreg import io, viewer
 
     if not command.files:
         raise ValueError("no file to view: name at least one.")
-    if not command.output.parent.is_dir():
-        raise ValueError(f"{command.output}: its folder does not exist: make it first.")
-    viewer.write_page(command.output, {str(path): _read(path) for path in command.files})
+    _check_folder(command.output)
+    clouds = {str(path): _finite(io.read_cloud(path), path) for path in command.files}
+    viewer.write_page(command.output, clouds)
     _line("wrote", str(command.output))
     if command.open:
         webbrowser.open(command.output.resolve().as_uri())
     return SUCCESS
+
+
+def _finite(points: np.ndarray, path: Path) -> np.ndarray:
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        raise ValueError(f"{path}: no point is finite: export the file again.")
+    return points
 
 
 def read_matrix(path: Path) -> np.ndarray:
@@ -221,15 +242,16 @@ def read_matrix(path: Path) -> np.ndarray:
       ValueError: there is no such file, or it holds no 4x4 matrix.
     """
     try:
-        if path.suffix == ".json":
+        if path.suffix.lower() == ".json":
             matrix = np.asarray(json.loads(path.read_text("utf-8"))["transformation"], float)
-        elif path.suffix == ".npy":
+        elif path.suffix.lower() == ".npy":
             matrix = np.asarray(np.load(path, allow_pickle=False), float)
         else:
-            matrix = np.loadtxt(path, delimiter="," if path.suffix == ".csv" else None)
+            numbers = path.read_text("utf-8").replace(",", " ").split()
+            matrix = np.array(numbers, float).reshape(4, 4)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file: correct the path.") from None
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, EOFError) as error:
         raise ValueError(
             f"{path} holds no 4x4 matrix ({error}): write four lines of four numbers."
         ) from None
@@ -238,39 +260,34 @@ def read_matrix(path: Path) -> np.ndarray:
     return matrix
 
 
-def matrix_text(matrix: np.ndarray) -> str:
-    """Four lines that `--initial` reads back."""
-    return "\n".join("  " + " ".join(f"{value: .9g}".ljust(16) for value in row) for row in matrix)
-
-
-def _read(path: Path) -> np.ndarray:
-    from jaxreg import io
-
-    return io.read_cloud(path)
-
-
 def _line(name: str, value: str) -> None:
-    _out.print(f"{name:<16} {value}", markup=False)
+    _print(f"{name:<16} {value}")
+
+
+def _print(text: str) -> None:
+    Console(highlight=False, soft_wrap=True).print(text, markup=False)
 
 
 @contextlib.contextmanager
-def _compiling() -> Iterator[None]:
-    """Programs kept on disk, and a word of patience where there are none yet."""
+def _patience() -> Iterator[None]:
+    """A spinner on a terminal; and once, where a program is not on disk yet, a word about that."""
     import jax
+    from jax import monitoring
 
     from jaxreg import compilation
 
-    compilation.enable_compilation_cache()
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    directory = Path(jax.config.jax_compilation_cache_dir or ".")
-    first = not any(directory.glob("*"))
-    text = "registering"
-    if first:
-        text = "first run on this machine: compiling, which takes half a minute; later runs do not"
-    if sys.stderr.isatty():
-        with _err.status(text):
+    compilation.enable_compilation_cache(least_seconds=0.0)
+    directory, told = jax.config.jax_compilation_cache_dir, []
+    console = Console(stderr=True, highlight=False)
+
+    def listen(event: str, **_) -> None:
+        if event == _CACHE_MISS and not told:
+            told.append(event)
+            console.print(_COMPILING.format(directory=directory), soft_wrap=True, markup=False)
+
+    monitoring.register_event_listener(listen)
+    try:
+        with console.status("registering"):
             yield
-        return
-    if first:
-        _err.print(text)
-    yield
+    finally:
+        monitoring.unregister_event_listener(listen)

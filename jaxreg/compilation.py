@@ -18,17 +18,19 @@ def jit(function: Callable, **options) -> Callable:
     return jax.jit(function, **options)
 
 
-def enable_compilation_cache() -> None:
-    """Keep compiled programs in a directory of this user, for the next process.
+def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
+    """Keep programs that took `least_seconds` to compile on disk, for this user's next process.
 
     Used by the command line tools only; a library must not change a program's configuration. A cache
     that others could write to would run their code, so the directory is private (0700). Set
-    JAX_COMPILATION_CACHE_DIR to choose another.
+    JAX_COMPILATION_CACHE_DIR to choose another. Where none can be made, nothing is kept.
     """
-    if jax.config.jax_compilation_cache_dir:
-        return
-    root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    directory = root / "jaxreg" / "xla"
-    directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    jax.config.update("jax_compilation_cache_dir", str(directory))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    if not jax.config.jax_compilation_cache_dir:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        directory = root / "jaxreg" / "xla"
+        try:
+            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", least_seconds)

@@ -155,9 +155,7 @@ def _searched(
     return _best(more, source, reference, spacing, largest, config)
 
 
-def _best(
-    pool, source, reference, spacing, largest_deg, config
-) -> tuple[RigidTransform, float, float]:
+def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidTransform, float]:
     """The pose of a pool that agrees best after polishing, the lead over others, its disagreement."""
     pool = host.turned_less(pool, largest_deg)
     scores = host.disagreement(pool, source, reference, 3 * spacing)

@@ -3,8 +3,7 @@
 import base64
 import html
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxreg import summary
 from jaxreg.register import ScanRegistration
+from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000
 """Most points of a cloud on the page: 120 kB, and a frame in a few milliseconds."""
@@ -42,8 +43,8 @@ def write_registration_page(
     content = {
         "clouds": clouds,
         "motion": _motion(result, source[rows], origin, shift),
-        "figures": [[name, value] for name, value in figures(result).items()],
-        "verdict": {"text": verdict_line(result), "good": result.success},
+        "figures": [[name, value] for name, value in summary.figures(result).items()],
+        "verdict": {"text": summary.verdict_line(result), "good": result.success},
     }
     _write(path, f"{names[0]} on {names[1]}", content)
 
@@ -62,29 +63,31 @@ def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]])
     _write(path, ", ".join(clouds), {"clouds": shown, "motion": None, "figures": sizes})
 
 
-def verdict_line(result: ScanRegistration) -> str:
-    """Success or not, in words, with the probability."""
-    chance = f"probability {result.probability:.2f}"
-    if result.success:
-        return f"success ({chance})"
-    return f"not trustworthy ({chance} that the pose is right)"
+def draw_registration(
+    path: str | Path,
+    source: Float[np.ndarray, "n 3"],
+    reference: Float[np.ndarray, "m 3"],
+    result: ScanRegistration,
+) -> None:
+    """The same as a picture: before and after from two sides, and the confidence; by `plot_pair`.
 
+    As on the page, large clouds are thinned, and a source that is far away is brought near before
+    the registration.
+    """
+    from jaxreg.pictures import plot_pair  # matplotlib, which the page does not need
 
-def figures(result: ScanRegistration) -> dict[str, str]:
-    """What a reader wants to know, as text."""
-    _, angle = _axis_angle(result.rotation)
-    deviations = np.sqrt(np.maximum(np.diag(result.covariance), 0))
-    return {
-        "rotation": f"{math.degrees(angle):.3f} deg",
-        "translation": ", ".join(f"{x:.6g}" for x in result.translation),
-        "overlap": f"{result.overlap:.2f}",
-        "fitness": f"{result.fitness:.2f} within {result.reach:.4g}",
-        "inlier rmse": f"{result.inlier_rmse:.4g}",
-        "one sigma": f"{math.degrees(deviations[:3].max()):.2g} deg, {deviations[3:].max():.2g}",
-        "weak directions": "\n".join(result.weak_directions) or "none",
-        "dropped points": str(result.dropped),
-        "time": f"{result.seconds:.2f} s",
-    }
+    rows = shown_rows(source)
+    moving, fixed = source[rows], _shown(reference)
+    shift = brought_near(moving, fixed)
+    title = summary.verdict_line(result)
+    plot_pair(
+        moving + shift,
+        fixed,
+        RigidTransform(result.rotation, result.translation - result.rotation @ shift),
+        path,
+        confidence=result.confidence[rows],
+        title=title + ("; before: source brought near" if shift.any() else ""),
+    )
 
 
 def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
@@ -137,26 +140,17 @@ def _motion(
 
     The page has the source shifted before the motion, and ends where it ends.
     """
-    axis, angle = _axis_angle(result.rotation)
+    axis, angle = summary.axis_angle(result.rotation)
     centre = source.mean(axis=0)
     before, after = centre + shift, result.rotation @ centre + result.translation
     ways = {"before": (before - origin).tolist(), "after": (after - origin).tolist()}
     return {"axis": axis.tolist(), "angle": angle, "shortened": bool(shift.any())} | ways
 
 
-def _axis_angle(rotation: np.ndarray) -> tuple[np.ndarray, float]:
-    from scipy.spatial.transform import Rotation
-
-    vector = Rotation.from_matrix(rotation).as_rotvec()
-    angle = float(np.linalg.norm(vector))
-    return (vector / angle, angle) if angle > 0 else (np.array([0.0, 0.0, 1.0]), 0.0)
-
-
-def _middle(points: Sequence) -> np.ndarray:
+def _middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     """Coordinates are shown relative to this: JavaScript's float32 arrays know no UTM offsets."""
-    points = np.asarray(points)
-    points = points[np.isfinite(points).all(axis=1)]
-    return (points.min(axis=0) + points.max(axis=0)) / 2
+    finite = points[np.isfinite(points).all(axis=1)]
+    return (finite.min(axis=0) + finite.max(axis=0)) / 2
 
 
 def _shown(points: np.ndarray) -> np.ndarray:

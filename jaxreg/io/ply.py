@@ -23,7 +23,8 @@ def read(path: Path) -> np.ndarray:
 
 def _open(path: Path) -> PlyData:
     try:
-        return PlyData.read(str(path))
+        # Without a memory map a file can be written again under its own name.
+        return PlyData.read(str(path), mmap=False)
     except PlyParseError as error:
         # plyfile says which element and row, or which line of the header.
         raise ValueError(f"malformed or truncated PLY ({error})") from None
