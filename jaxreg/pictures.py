@@ -44,8 +44,9 @@ def plot_pair(
     """Draw a pair before and after registration, from two sides, as PNG.
 
     Source blue, reference yellow, aligned source green; far points are paler. All panels have one
-    scale, and the reference stays in its place. With `truth` the title states the errors, with
-    `confidence` a third column shows the aligned source coloured by it.
+    scale, and the reference stays in its place. With `truth` the title states the errors, without
+    it the motion, unless `title` is given. With `confidence` a third column shows the aligned
+    source coloured by it.
     """
     source, reference = np.asarray(source, np.float64), np.asarray(reference, np.float64)
     rotation, translation = (np.asarray(x, np.float64) for x in transform)
@@ -64,7 +65,8 @@ def plot_pair(
             _draw(axes, clouds, view, _project(everything, view))
     if confident is not None:
         figure.colorbar(ScalarMappable(cmap="viridis"), ax=grid[:, -1], shrink=0.4)
-    figure.suptitle("\n".join(filter(None, [title, _describe(transform, truth)])), fontsize=12)
+    described = "" if title and truth is None else _describe(transform, truth)
+    figure.suptitle("\n".join(filter(None, [title, described])), fontsize=12)
     named = {"source": SOURCE, "reference": REFERENCE, "aligned source": ALIGNED}
     dots = [Line2D([], [], marker="o", ls="", color=c, label=name) for name, c in named.items()]
     figure.legend(handles=dots, loc="outside lower center", ncols=3, frameon=False)

@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -17,7 +18,7 @@ from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000
 """Most points of a cloud on the page: 120 kB, and a frame in a few milliseconds."""
-_COLOURS = ("source", "reference", "aligned")
+_COLOURS = ("source", "reference", "aligned", "fourth", "fifth")
 
 
 def write_registration_page(
@@ -79,21 +80,29 @@ def draw_registration(
     rows = shown_rows(source)
     moving, fixed = source[rows], _shown(reference)
     shift = brought_near(moving, fixed)
-    title = summary.verdict_line(result)
     plot_pair(
         moving + shift,
         fixed,
         RigidTransform(result.rotation, result.translation - result.rotation @ shift),
         path,
         confidence=result.confidence[rows],
-        title=title + ("; before: source brought near" if shift.any() else ""),
+        title="\n".join(_headline(result, moving, shortened=bool(shift.any()))),
     )
+
+
+def _headline(result: ScanRegistration, source: np.ndarray, *, shortened: bool) -> list[str]:
+    centre = source.mean(axis=0)
+    way = np.linalg.norm(result.rotation @ centre + result.translation - centre)
+    angle = math.degrees(summary.axis_angle(result.rotation)[1])
+    motion = f"turned by {angle:.1f} deg, centroid moved by {way:.3g}"
+    note = "; before: the source is shown nearer than it is" if shortened else ""
+    return [summary.verdict_line(result), motion + note]
 
 
 def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
     template = (resources.files("jaxreg") / "viewer.html").read_text("utf-8")
-    # "</" would end the script element that holds the data.
-    data = json.dumps(content).replace("</", "<\\/")
+    # "</script" would end the element that holds the data, "<!--" could swallow its end.
+    data = json.dumps(content).replace("<", "\\u003c")
     page = template.replace("{{title}}", html.escape(title)).replace("{{data}}", data)
     Path(path).write_text(page, encoding="utf-8")
 
@@ -110,7 +119,7 @@ def _cloud(
     """Points relative to `origin` as 16-bit steps about their own middle."""
     relative = points - origin
     centre = (relative.min(axis=0) + relative.max(axis=0)) / 2
-    step = max(float(np.abs(relative - centre).max()) / 32767, np.finfo(np.float32).tiny)
+    step = max(float(np.abs(relative - centre).max()) / 32767, 1e-30)
     steps = np.round((relative - centre) / step).astype("<i2")
     place = {"points": _packed(steps), "centre": centre.tolist(), "step": step}
     return {"name": name, "colour": colour, "moves": moves, "count": count} | place
@@ -121,7 +130,8 @@ def brought_near(
 ) -> Float[np.ndarray, "3"]:
     """How to shift the source for a picture of "before" in which both clouds can be seen.
 
-    Zero unless the gap between them is wider than the clouds. All points must be finite.
+    Zero unless the gap between them is wider than the clouds; else they come to touch. All points
+    must be finite.
     """
     centres = source.mean(axis=0), reference.mean(axis=0)
     radii = [
@@ -129,8 +139,8 @@ def brought_near(
         for points, centre in zip((source, reference), centres, strict=True)
     ]
     way = centres[0] - centres[1]
-    distance, most = np.linalg.norm(way), 1.5 * sum(radii)
-    return np.zeros(3) if distance <= most else way * (most / distance - 1)
+    distance, near = np.linalg.norm(way), sum(radii)
+    return np.zeros(3) if distance <= 1.5 * near else way * (near / distance - 1)
 
 
 def _motion(
