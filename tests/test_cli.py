@@ -248,9 +248,10 @@ def test_console_script_is_declared():
 
 
 def test_first_process_says_that_it_compiles_and_the_second_need_not(folder, tmp_path):
-    code = "import sys; from jaxreg.cli import main; sys.exit(main())"
-    start = ["--initial", str(folder / "T.txt"), "--refine", "none"]
-    command = [sys.executable, "-c", code, "register", str(folder / "a.ply"), "b.pcd", *start]
+    code = "import sys; from jaxreg.cli import main; status = main();"
+    code += "print(*sys.modules, file=open('modules', 'w')); sys.exit(status)"
+    start = ["--initial", "T.txt", "--refine", "none", "--html", "page.html"]
+    command = [sys.executable, "-c", code, "register", "a.ply", "b.pcd", *start]
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(SOURCE_ROOT)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     runs = [
@@ -263,6 +264,9 @@ def test_first_process_says_that_it_compiles_and_the_second_need_not(folder, tmp
     assert "compiling" in runs[0].stderr
     assert str(tmp_path) in runs[0].stderr
     assert runs[1].stderr == ""
+    # Nothing was drawn, trained or sampled, so what does that was not imported.
+    unneeded = {"matplotlib", "orbax", "optax", "trimesh", "laspy", "h5py", "scipy.optimize"}
+    assert unneeded & set((folder / "modules").read_text().split()) == set()
     timeless = [
         [line for line in one.stdout.splitlines() if "time" not in line[:6]] for one in runs
     ]

@@ -1,0 +1,40 @@
+"""What a start costs: libraries that only some tasks need are not imported by the others.
+
+Each of them takes a tenth of a second to two seconds; a clock would measure the machine instead.
+"""
+
+import subprocess
+import sys
+
+import pytest
+
+PICTURES, CHECKPOINTS, MESHES = {"matplotlib", "PIL"}, {"orbax", "tensorstore"}, {"trimesh"}
+TRAINING, FILES, BROWSER = {"optax", "h5py"}, {"plyfile", "laspy"}, {"plotly", "selenium"}
+HEAVY = PICTURES | CHECKPOINTS | MESHES | TRAINING | FILES | BROWSER | {"open3d", "sklearn"}
+SCIPY = {"scipy.optimize", "scipy.stats", "scipy.interpolate", "scipy.signal"}
+
+
+def loaded_by(code: str) -> set[str]:
+    program = f"import sys\n{code}\nprint(*sys.modules, sep='\\n')"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.splitlines())
+
+
+def test_the_list_is_of_modules_that_exist_here():
+    assert loaded_by("import matplotlib, orbax.checkpoint, trimesh") >= {
+        *("matplotlib", "orbax", "trimesh")
+    }
+
+
+@pytest.mark.parametrize(
+    ("code", "unneeded"),
+    [
+        ("import jaxreg", HEAVY | SCIPY | {"tyro", "rich.progress"}),
+        ("import jaxreg.cli", HEAVY | SCIPY),
+        ("import jaxreg.io, jaxreg.summary, jaxreg.viewer", (HEAVY - {"plyfile"}) | SCIPY),
+    ],
+)
+def test_start_is_lean(code, unneeded):
+    assert loaded_by(code) & unneeded == set()
