@@ -135,8 +135,9 @@ def test_picture_tells_the_true_motion_where_the_source_is_brought_near(tmp_path
     result = registration(source, reference + far, translation=translation + far)
     viewer.draw_registration(tmp_path / "r.png", source, reference + far, result)
     before, after, _ = np.array_split(imread(tmp_path / "r.png")[150:-100, :-200, :3], 3, axis=1)
-    assert blue(255 * before).sum() > 1000 > 10 * blue(255 * after).sum()
-    assert green(255 * after).sum() > 1000 > 10 * green(255 * before).sum()
+    # A panel's rim reaches into its neighbour's third of the picture.
+    assert blue(255 * before).sum() > max(1000, 20 * blue(255 * after).sum())
+    assert green(255 * after).sum() > max(1000, 20 * green(255 * before).sum())
     told = viewer._headline(result, source, shortened=True)
     angle = np.degrees(Rotation.from_matrix(POSE).magnitude())
     assert told[1].startswith(f"turned by {angle:.1f} deg, centroid moved by 1e+07; before: ")
