@@ -111,8 +111,12 @@ class PairConfig:
 class DataConfig:
     """Which shapes."""
 
-    name: Literal["modelnet40", "shapes", "seven_scenes", "icl_nuim"] = "modelnet40"
-    """Source: `shapes` is procedural and needs no file."""
+    name: Literal["modelnet40", "shapes", "folder", "seven_scenes", "icl_nuim"] = "modelnet40"
+    """Source: `shapes` is procedural and needs no file, `folder` is files of one's own."""
+    folder: str = ""
+    """The folder of these files: PLY, PCD, XYZ, ... (`jaxreg.io`), with or without train/ and test/."""
+    test_share: float = 0.2
+    """Share of these files, the last ones, to test on where there is no test/."""
     train_categories: Literal["all", "first20", "last20"] = "all"
     """ModelNet40 labels to train on."""
     test_categories: Literal["all", "first20", "last20"] = "all"

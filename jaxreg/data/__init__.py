@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from jaxreg.config import DataConfig
-from jaxreg.data import icl_nuim, modelnet, seven_scenes, shapes
+from jaxreg.data import folder, icl_nuim, modelnet, seven_scenes, shapes
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
 
 __all__ = ["Split", "data_root", "load_shapes", "make_pair", "make_pair_from_scans", "pair_sizes"]
@@ -50,8 +50,9 @@ def load_shapes(
     """Clouds (n, P, 3) float32 and labels (n,) int32 of the source that `config.name` names.
 
     `validation` is a share of the *training* shapes, chosen by `seed` and left out of `train`.
-    `points` is P where the source can choose (procedural shapes, resampled scans); ModelNet40 and
-    ICL-NUIM give the P of their files. `root` as of `data_root`; the procedural shapes need none.
+    `points` is P where the source can choose (procedural shapes, resampled scans, files of one's
+    own); ModelNet40 and ICL-NUIM give the P of their files. `root` as of `data_root`; procedural
+    shapes and `config.folder` need none.
 
     Raises:
       ValueError: an unknown name or split, missing data (the message gives the layout and where it
@@ -61,7 +62,7 @@ def load_shapes(
         raise ValueError(f"split must be 'train', 'validation' or 'test', got {split!r}.")
     if config.name == "shapes":
         return _load_procedural(config, split, points, seed)
-    if root is None:
+    if root is None and config.name != "folder":
         raise ValueError(
             f"data.name = '{config.name}' is read from files, and no folder is known: give "
             "--data-root, set $JAXREG_DATA, make data/ beside the configuration file, or use "
@@ -87,8 +88,16 @@ def _load_procedural(
 
 
 def _load_files(
-    config: DataConfig, split: Literal["train", "test"], root: str | Path, points: int, seed: int
+    config: DataConfig,
+    split: Literal["train", "test"],
+    root: str | Path | None,
+    points: int,
+    seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:
+    if config.name == "folder":
+        return folder.load(
+            config.folder, split, points=points, test_share=config.test_share, seed=seed
+        )
     if config.name == "modelnet40":
         categories = config.train_categories if split == "train" else config.test_categories
         return modelnet.load(root, split, categories=categories)
@@ -100,7 +109,7 @@ def _load_files(
             warnings.warn(seven_scenes.describe(root), stacklevel=3)
         return seven_scenes.load(root, split, points=points, stand_in=stand_in, seed=seed)
     raise ValueError(
-        "data.name must be 'modelnet40', 'shapes', 'seven_scenes' or 'icl_nuim', "
+        "data.name must be 'modelnet40', 'shapes', 'folder', 'seven_scenes' or 'icl_nuim', "
         f"got {config.name!r}."
     )
 
