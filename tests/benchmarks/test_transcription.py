@@ -1,0 +1,99 @@
+"""The library against the equations as one would first write them (`benchmarks/transcription.py`)."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks import transcription
+from jaxreg.config import Config, ModelConfig
+from jaxreg.model import init_variables, register_pair
+from jaxreg.pretrained import load_pretrained
+from jaxreg.training import batch_loss
+from jaxreg.types import Pair, PointCloud, RigidTransform
+
+# Flax promotes float64 with the float32 that it starts from.
+pytestmark = pytest.mark.loose
+
+SMALL = ModelConfig(
+    k=4, k_matching=3, channels=(8, 16), width=16, inlier_width=4, n_inliers=12, iterations=2
+)
+
+
+@pytest.fixture
+def rng(seed):
+    return np.random.default_rng(seed)
+
+
+def draw_pair(rng, n, m):
+    """Clouds that share most points; none of the two is a copy of the other."""
+    points = rng.uniform(-1, 1, (max(n, m), 3))
+    turn = Rotation.from_euler("zyx", rng.uniform(0, 0.5, 3)).as_matrix()
+    return points[:n], points[:m] @ turn.T + rng.uniform(-0.3, 0.3, 3)
+
+
+def variables_of(config):
+    """Parameters and statistics away from their initial zeros and ones."""
+    rng = np.random.default_rng(0)  # Of some other seeds no unit is alive, and no pose defined.
+    shapes = jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
+    variables = jax.tree.map(lambda x: rng.normal(0, 0.4, x.shape), shapes)
+    positive = jax.tree.map(lambda x: 0.5 + np.abs(x), variables["batch_stats"])
+    return {"params": variables["params"], "batch_stats": positive}
+
+
+@functools.cache
+def both(config):
+    """The two registrations, compiled."""
+    library = functools.partial(register_pair, config=Config(model=config))
+    written = functools.partial(transcription.register, config=config)
+    return jax.jit(library), jax.jit(written)
+
+
+def assert_close(ours, written, atol):
+    np.testing.assert_allclose(ours.rotation, written.rotation, atol=atol)
+    np.testing.assert_allclose(ours.translation, written.translation, atol=atol)
+    np.testing.assert_allclose(ours.confidence, written.confidence, atol=atol)
+    np.testing.assert_allclose(ours.correspondences, written.copy, atol=atol)
+
+
+def test_registration_is_that_of_the_equations(rng):
+    config = dataclasses.replace(SMALL, k_matching=5)
+    variables = variables_of(config)
+    pair = draw_pair(rng, 30, 24)
+    results = [register(variables, *pair) for register in both(config)]
+    assert_close(*results, atol=1e-9)
+
+
+def test_gradient_of_the_loss_is_that_of_the_equations(rng):
+    config = Config(model=SMALL)
+    variables = variables_of(SMALL)
+    arguments = variables["params"], variables["batch_stats"]
+    sources, references = (np.stack(x) for x in zip(*[draw_pair(rng, 24, 20) for _ in range(2)]))
+    clouds = [PointCloud(x, np.ones(x.shape[:2], bool)) for x in (sources, references)]
+    pairs = Pair(*clouds, RigidTransform(np.zeros((2, 3, 3)), np.zeros((2, 3))))
+    ours, written = (
+        jax.jit(jax.value_and_grad(functools.partial(f, config=config), has_aux=aux))
+        for f, aux in ((batch_loss, True), (transcription.batch_loss, False))
+    )
+    (loss, _), gradient = ours(*arguments, pairs)
+    expected_loss, expected = written(*arguments, sources, references)
+    np.testing.assert_allclose(loss, expected_loss, rtol=1e-9)
+    assert max(np.abs(x).max() for x in jax.tree.leaves(expected)) > 1
+    for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.float32
+def test_released_weights_register_as_the_equations_say(rng):
+    variables, config = load_pretrained("modelnet40")
+    source, reference = (np.float32(0.5 * x) for x in draw_pair(rng, 768, 768))
+    ours, written = (register(variables, source, reference) for register in both(config.model))
+    np.testing.assert_allclose(ours.rotation, written.rotation, atol=1e-5)
+    np.testing.assert_allclose(ours.translation, written.translation, atol=1e-5)
+    # Rounding of the moved points may swap neighbours that are equally far in the last digit.
+    for a, b in ((ours.confidence, written.confidence), (ours.correspondences, written.copy)):
+        difference = np.sort(np.abs(np.asarray(a) - b).reshape(768, -1).max(axis=1))
+        assert difference[-8] < 1e-4, difference[-16:]
