@@ -3,6 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
 BATCH_AXIS = "batch"
@@ -20,8 +21,8 @@ class BatchNorm(nn.Module):
     """Batch normalisation over all valid points of all clouds of a batch.
 
     While training, statistics run over the leading axes and over the `vmap` axis `BATCH_AXIS`;
-    padding does not count, and every point counts the same whatever the size of its cloud. At
-    evaluation running means are used and no batch axis is needed.
+    padding does not count (but must be finite), and every point counts the same whatever the size
+    of its cloud. At evaluation running means are used and no batch axis is needed.
     """
 
     momentum: float
@@ -55,28 +56,27 @@ class _Normalize(nn.Module):
         )
         statistics = mean.value, var.value
         if train:
-            x = jnp.where(mask[..., None], x, 0)
             statistics = _statistics(x, mask)
             for running, batch in zip((mean, var), statistics, strict=True):
                 batch = batch.astype(running.value.dtype)
                 running.value = self.momentum * running.value + (1 - self.momentum) * batch
         factor = jax.lax.rsqrt(statistics[1] + self.epsilon) * scale
-        return (x - statistics[0]) * factor + bias
+        return x * factor + (bias - statistics[0] * factor)
 
 
 def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
     """Mean and variance of every channel over the valid points of the whole batch."""
-    axes = tuple(range(x.ndim - 1))
+    # A sum over points is a product with the mask: XLA:CPU reduces long columns slowly.
+    weight = jnp.broadcast_to(mask, x.shape[:-1]).reshape(-1).astype(x.dtype)
+    x = x.reshape(-1, x.shape[-1])
 
     def over_batch(values):
-        return jax.lax.psum(jnp.sum(values, axes), BATCH_AXIS)
+        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), BATCH_AXIS)
 
-    valid = jnp.broadcast_to(mask, x.shape[:-1])
-    count = jnp.maximum(over_batch(valid.astype(x.dtype)), 1)
+    count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)
     mean = over_batch(x) / count
     # Two passes: E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
-    deviation = jnp.where(valid[..., None], x - mean, 0)
-    return mean, over_batch(deviation * deviation) / count
+    return mean, over_batch((x - mean) ** 2) / count
 
 
 class DGCNN(nn.Module):
@@ -95,6 +95,7 @@ class DGCNN(nn.Module):
     def __call__(
         self, edges: Float[Array, "n k d"], mask: Bool[Array, "n"], *, train: bool
     ) -> Float[Array, "n c"]:
+        edges = jnp.where(mask[:, None, None], edges, 0)
         # K in front: the maximum over it is then an elementwise maximum of contiguous blocks.
         x, pooled = jnp.swapaxes(edges, 0, 1), []
         for channels in self.channels:

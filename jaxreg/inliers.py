@@ -13,7 +13,13 @@ from jaxreg.features import BatchNorm
 
 
 def _confidence(consistency: Float[Array, "n"]) -> Float[Array, "n"]:
-    return 1 - jnp.tanh(jnp.abs(consistency))
+    """``1 - tanh|x|``, written without the difference: where it is small it is still accurate."""
+    return 2 * jax.nn.sigmoid(-2 * jnp.abs(consistency))
+
+
+def _stacked(source, copy, mask) -> Float[Array, "2 n k d"]:
+    """Both structures with their padding at zero: what passes through a network must be finite."""
+    return jnp.where(mask[None, :, None, None], jnp.stack([source, copy]), 0)
 
 
 class InlierNetwork(nn.Module):
@@ -41,7 +47,7 @@ class InlierNetwork(nn.Module):
             return jax.nn.leaky_relu(x, 0.2)
 
         # Both structures pass together: one set of statistics, so that equal ones stay equal.
-        x, valid = jnp.stack([source, copy]), mask[None, :, None]
+        x, valid = _stacked(source, copy, mask), mask[None, :, None]
         fused = layer(layer(x, self.width), 2 * self.width)
         difference, valid = fused[0] - fused[1], mask[:, None]
         attention = nn.Dense(2 * self.width)(layer(difference, 2 * self.width))
@@ -72,7 +78,7 @@ class PredecessorInlierNetwork(nn.Module):
             x = BatchNorm(self.bn_momentum)(x, valid, train=train)
             return jax.nn.leaky_relu(x, 0.2)
 
-        x, valid = jnp.stack([source, copy]), mask[None, :, None]
+        x, valid = _stacked(source, copy, mask), mask[None, :, None]
         for width in (self.width, 2 * self.width):
             x = activate(nn.Conv(width, kernel_size=(3,), padding=1)(x))
         difference, valid = x[1] - x[0], mask[:, None]

@@ -11,21 +11,27 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.numerics import safe_sqrt
+from jaxreg.numerics import row_min, safe_sqrt
 
 _FAR = 1e30
+
+
+def squared_feature_distance(
+    source: Float[Array, "n c"], reference: Float[Array, "m c"]
+) -> Float[Array, "n m"]:
+    """``D[i, j]^2 = |source[i] - reference[j]|^2`` of features; rounding may leave it below zero."""
+    # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as they can be.
+    center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))
+    a, b = source - center, reference - center
+    product = jnp.matmul(a, b.T, precision=Precision.HIGHEST)
+    return jnp.sum(a * a, axis=1)[:, None] - 2 * product + jnp.sum(b * b, axis=1)[None, :]
 
 
 def feature_distance(
     source: Float[Array, "n c"], reference: Float[Array, "m c"]
 ) -> Float[Array, "n m"]:
     """``D[i, j] = |source[i] - reference[j]|`` of features (Eq. 3)."""
-    # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as they can be.
-    center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))
-    a, b = source - center, reference - center
-    product = jnp.matmul(a, b.T, precision=Precision.HIGHEST)
-    square = jnp.sum(a * a, axis=1)[:, None] - 2 * product + jnp.sum(b * b, axis=1)[None, :]
-    return safe_sqrt(square)
+    return safe_sqrt(squared_feature_distance(source, reference))
 
 
 def matching_scores(
@@ -34,7 +40,9 @@ def matching_scores(
     """``M[i, j] = softmax_j(-D[i, j])`` over valid columns (Eq. 3); rows sum to 1."""
     if valid is not None:
         distance = jnp.where(valid[None, :], distance, _FAR)
-    return jax.nn.softmax(-distance, axis=1)
+    nearest = jax.lax.stop_gradient(row_min(distance))[:, None]
+    weight = jnp.exp(nearest - distance)
+    return weight / jnp.sum(weight, axis=1, keepdims=True)
 
 
 class Incidence(NamedTuple):
@@ -79,13 +87,44 @@ def neighborhood_sum(
     return jax.lax.custom_linear_solve(
         lambda x: x,
         scores,
-        solve=lambda _, x: _two_passes(_gather, x, source, reference),
+        solve=lambda _, x: _gather_both(x, source, reference),
         transpose_solve=lambda _, x: _two_passes(_collect, x, source, reference),
     )
 
 
+def _row_peak(x: Float[Array, "n m"]) -> Float[Array, "n"]:
+    """``max_j x[i, j]``; entries that share the maximum share the derivative."""
+    highest = jax.lax.stop_gradient(x) >= -row_min(-jax.lax.stop_gradient(x))[:, None]
+    count = jnp.sum(highest, axis=1, dtype=x.dtype)
+    return jnp.sum(jnp.where(highest, x, 0), axis=1) / count
+
+
 def _two_passes(one_pass, x: Float[Array, "n m"], source: Incidence, reference: Incidence):
-    return one_pass(one_pass(x, source).T, reference).T
+    return _materialized(one_pass(one_pass(x, source).T, reference).T)
+
+
+def _materialized(x: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """`x`, written out before anything reads it.
+
+    XLA would merge a transposition with what comes after it, and read at strides, number by number;
+    alone it is ten times as fast. Nothing crosses the border of a loop, so the rows are copied in one.
+    """
+    n = x.shape[0]
+    half = (n + 1) // 2
+
+    def copy(part, out):
+        start = jnp.minimum(part * half, n - half)
+        rows = jax.lax.dynamic_slice_in_dim(x, start, half)
+        return jax.lax.dynamic_update_slice_in_dim(out, rows, start, axis=0)
+
+    return jax.lax.fori_loop(0, 2, copy, jnp.zeros_like(x))
+
+
+def _gather_both(x: Float[Array, "n m"], source: Incidence, reference: Incidence):
+    if source.idx.shape[1] == reference.idx.shape[1] == 1:
+        rows = x.at[source.idx[:, 0]].get(mode="promise_in_bounds")
+        return rows.at[:, reference.idx[:, 0]].get(mode="promise_in_bounds")
+    return _two_passes(_gather, x, source, reference)
 
 
 def _gather(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
@@ -168,4 +207,4 @@ def matching_maps(
 def match(maps: Maps, reference: Float[Array, "m 3"]) -> Matches:
     """The reference copy ``q~_i = sum_j F[i, j] q_j`` (Eq. 6) and the peaks of the maps."""
     copy = jnp.matmul(maps.final, reference, precision=Precision.HIGHEST)
-    return Matches(copy, jnp.max(maps.dual, axis=1), jnp.max(maps.final, axis=1))
+    return Matches(copy, _row_peak(maps.dual), _row_peak(maps.final))

@@ -24,8 +24,10 @@ from jaxreg.matching import (
     match,
     matching_maps,
     neighborhood_sum,
+    squared_feature_distance,
 )
 from jaxreg.neighbors import knn, without_padding
+from jaxreg.numerics import safe_sqrt
 from jaxreg.procrustes import weighted_procrustes
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
@@ -146,14 +148,17 @@ def _both_features(variables, points, graph, mask, config, train):
 
 
 def _match(source_features, reference_features, source_graph, reference_graph, reference, config):
-    distance = feature_distance(source_features[0], reference_features[0])
+    squared = squared_feature_distance(source_features[0], reference_features[0])
+    distance = safe_sqrt(squared)
     nearest_distance, nearest_graphs = None, None
     if config.one_nn == "own":
         nearest_distance = feature_distance(source_features[1], reference_features[1])
         nearest_graphs = (source_graph.own.matching, reference_graph.own.matching)
     elif config.one_nn == "gather":
-        # The feature of the 1-NN point is that of the same point in the input cloud.
-        nearest_distance = neighborhood_sum(distance, source_graph.nearest, reference_graph.nearest)
+        # The feature of the 1-NN point is that of the same point in the input cloud. The root comes
+        # last, since XLA would take it anew, number by number, for each entry that is gathered.
+        nearest = (source_graph.nearest, reference_graph.nearest)
+        nearest_distance = safe_sqrt(neighborhood_sum(squared, *nearest))
     elif config.one_nn == "self":
         nearest_distance = distance
     maps = matching_maps(
@@ -206,9 +211,7 @@ def iterate(
         features, variables = _both_features(
             variables, points, source_graph, source.mask, config, train
         )
-        # The maps are computed again in the backward pass: cheaper than writing out and reading
-        # back a dozen (n, m) arrays a step, and a third of the memory.
-        matches = jax.checkpoint(_match, static_argnums=5)(
+        matches = _match(
             features, reference_features, source_graph, reference_graph, reference, config
         )
         structures = [_structure(x, source_graph.neighbors, config) for x in (points, matches.copy)]
@@ -222,6 +225,9 @@ def iterate(
         return (rigid.compose(motion, total), variables), seen
 
     start = (rigid.identity(source.points.dtype), variables)
+    # A step is computed again in the backward pass: cheaper than writing out and reading back a
+    # dozen (n, m) arrays a step, and less than half of the memory.
+    step = jax.checkpoint(step, prevent_cse=False)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables
 

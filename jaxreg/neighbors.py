@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.numerics import row_min
+
 
 def squared_distances(
     points: Float[Array, "n 3"], others: Float[Array, "m 3"]
@@ -82,9 +84,9 @@ def nearest_in(
         distance = jnp.where(mask[None, :], distance, jnp.inf)
     # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
     # argmin, which carries both through one reduction, element by element.
-    smallest = jnp.min(distance, axis=1, keepdims=True)
     column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
-    return jnp.min(jnp.where(distance <= smallest, column, others.shape[0] - 1), axis=1)
+    smallest = row_min(distance)[:, None]
+    return row_min(jnp.where(distance <= smallest, column, others.shape[0] - 1))
 
 
 def _check_points(points: Array) -> None:

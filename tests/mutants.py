@@ -166,8 +166,8 @@ MUTANTS = [
     ),
     Mutant(
         "inliers",
-        "1 - jnp.tanh(jnp.abs(consistency))",
-        "1 - jnp.tanh(consistency)",
+        "2 * jax.nn.sigmoid(-2 * jnp.abs(consistency))",
+        "2 * jax.nn.sigmoid(-2 * consistency)",
         "test_confidence_point_by_point",
     ),
     Mutant(

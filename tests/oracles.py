@@ -144,7 +144,8 @@ def inlier_confidence(params, statistics, source, copy):
         f_mu = np.array([dense(params["Dense_2"], layer(3, 2, x)) for x in d])
         delta = softmax_rows(f_mu.T).T
         pooled = (delta * d).sum(axis=0)
-        confidence.append(1 - np.tanh(np.abs(dense(params["Dense_4"], pooled)[0])))
+        # 1 - tanh|x|; as a difference it would be rounding noise where |x| is above 15 or so.
+        confidence.append(2 / (np.exp(2 * np.abs(dense(params["Dense_4"], pooled)[0])) + 1))
     return np.array(confidence)
 
 
