@@ -23,7 +23,7 @@ from jaxreg.data import data_root
 from jaxreg.training import train
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-FULL = {"model.n_inliers": 96, "pairs.points": 384, "pairs.kept": 288}
+FULL = {"model.n_inliers": 64, "pairs.points": 256, "pairs.kept": 192}
 """Of the configuration for unseen objects, what a small budget changes: the size of the crops."""
 ROWS: dict[str, dict[str, Any]] = {
     "full": {},
@@ -55,8 +55,8 @@ class Options:
 
     workdir: str = "runs/ablation"
     seeds: int = 3
-    steps: int = 200
-    pairs: int = 128
+    steps: int = 150
+    pairs: int = 64
     """Test pairs of each column."""
     rows: tuple[str, ...] = tuple(ROWS)
     data_root: str = ""
@@ -67,8 +67,10 @@ class Options:
 def row_config(row: str, seed: int, steps: int) -> Config:
     """The configuration that a row is trained with: validated once, at its end."""
     base = flatten_dict(to_dict(load_config(CONFIGS / f"{COLUMNS['clean']}.toml")), sep=".")
-    budget = {"train.steps": steps, "train.validate_every": steps, "train.seed": seed}
-    return from_dict(unflatten_dict(base | FULL | budget | ROWS[row], sep="."))
+    budget = {"train.steps": steps, "train.validate_every": steps, "train.validation_pairs": 16}
+    return from_dict(
+        unflatten_dict(base | FULL | budget | {"train.seed": seed} | ROWS[row], sep=".")
+    )
 
 
 def evaluate(workdir: Path, root: Path | None, pairs: int) -> dict[str, dict[str, float]]:
