@@ -3,12 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py benchmarks examples)
-TABLES := $(wildcard configs/modelnet40_*.toml)
-BASELINES := identity icp open3d_icp open3d_fgr open3d_fpfh_ransac open3d_fgr_gicp \
-  open3d_ransac_icp small_gicp
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help demo test slow lint types fuzz mutants tables baselines clean
+.PHONY: help demo test slow lint types fuzz mutants tables figures baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -39,15 +36,11 @@ mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must
 
 baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
 
-tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines
-	mkdir -p runs/tables
-	set -e; for config in $(basename $(notdir $(TABLES))); do \
-	  $(BIN)/python evaluate.py configs/$$config.toml --json runs/tables/$$config.json; \
-	  for method in $(BASELINES); do \
-	    $(BIN)/python evaluate.py configs/$$config.toml --method $$method --pairs 256 \
-	      --json runs/tables/$$config-$$method.json; \
-	  done; \
-	done
+tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (30 minutes)
+	$(BIN)/python benchmarks/tables.py
+
+figures: $(VENV)/.installed  ## the pictures of the documentation
+	$(BIN)/python benchmarks/figures.py
 
 clean:  ## remove the environment, caches and runs
 	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*

@@ -20,7 +20,16 @@ from jaxreg.data import data_root
 from jaxreg.options import parse
 from jaxreg.report import results_table
 
-_CHOICE = ("checkpoint", "predecessor", "method", "transforms", "pairs", "batch", "save_transforms")
+_CHOICE = (
+    "checkpoint",
+    "predecessor",
+    "method",
+    "transforms",
+    "refine",
+    "pairs",
+    "batch",
+    "save_transforms",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +45,8 @@ class Options:
     """Another method: identity, icp, or a baseline such as open3d_fgr (a wrong name lists them)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
+    refine: str = ""
+    """Refine the poses of the method on the clouds afterwards: icp, point_to_plane or gicp."""
     pairs: int = 0
     """Evaluate the first N pairs only; 0 is all."""
     batch: int = 8

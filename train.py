@@ -37,12 +37,14 @@ def main() -> None:
     workdir = options.workdir or f"runs/{path.stem}"
     enable_compilation_cache()
     try:
-        train(options.config, workdir, root=data_root(options.data_root, path))
+        root = data_root(options.data_root, path)
+        train(options.config, workdir, root=root)
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"error: {error}")
     plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
     if options.release:
-        release(options.release, workdir, f"python train.py {path} --workdir {workdir}")
+        command = f"python train.py {path} --workdir {workdir}"
+        release(options.release, workdir, command, root=root)
     print(f"best checkpoint, metrics.jsonl and curves.png: {workdir}")
 
 

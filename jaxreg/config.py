@@ -52,6 +52,9 @@ class ModelConfig:
     """N_c, correspondences kept by confidence (Eq. 12)."""
     svd: Literal["top", "all"] = "top"
     """Points of the weighted Procrustes: the top N_c (paper) or all of them (predecessor)."""
+    robust_rounds: int = 0
+    """Times that each weighted Procrustes is solved again with less weight on the pairs it cannot
+    explain (0 in the paper). Meant for inference."""
     iterations: int = 3
     """N_l, registration steps."""
     bn_momentum: float = 0.9
@@ -127,6 +130,15 @@ class DataConfig:
     """Procedural shapes to train on."""
     test_shapes: int = 256
     """Procedural shapes to test on."""
+    train_draws: int = 1
+    """Draws of points from every 7Scenes fragment to train on; each draw is a shape."""
+    test_draws: int = 1
+    """Draws of points from every 7Scenes fragment to test on (one in the published protocol)."""
+    test_pairs_from: Literal["shapes", "file"] = "shapes"
+    """`shapes`: test pairs are made from single shapes. `file`: the pairs that ICL-NUIM comes with,
+    in the pose they have there."""
+    label: str = ""
+    """What figures call the test data; empty: by what is found on disk."""
     test_seed: int = 0
     """Seed of the test pairs; not that of the training, so that all runs meet the same pairs."""
 

@@ -13,12 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from jaxreg import rigid
 from jaxreg.compilation import jit
-from jaxreg.config import ModelConfig, PairConfig
-from jaxreg.data.pairs import make_pair
+from jaxreg.config import ModelConfig, PairConfig, RefineConfig
+from jaxreg.data.pairs import make_pair, make_pair_from_scans
 from jaxreg.model import Variables, iterate
+from jaxreg.refine.gicp import gicp
 from jaxreg.refine.icp import icp
-from jaxreg.types import Pair, RigidTransform
+from jaxreg.refine.point_to_plane import point_to_plane
+from jaxreg.types import Pair, PointCloud, RigidTransform
 
 Method = Callable[[Pair], RigidTransform]
 
@@ -57,6 +60,37 @@ def pair_batches(
             _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config),
             min(batch, len(shapes) - start),
         )
+
+
+def _given_batch(key, numbers, source, target, transform, *, config: PairConfig) -> Pair:
+    def one(number, source, target, matrix):
+        pose = RigidTransform(matrix[:3, :3], matrix[:3, 3])
+        everywhere = jnp.ones(source.shape[0], bool)
+        still = rigid.apply(rigid.inverse(pose), target)
+        clouds = (PointCloud(points, everywhere) for points in (source, still))
+        return make_pair_from_scans(jax.random.fold_in(key, number), *clouds, config, pose)
+
+    return jax.vmap(one)(numbers, source, target, transform)
+
+
+_given_batch_jit = jit(_given_batch, static_argnames="config")
+
+
+def given_pair_batches(
+    clouds: tuple[Float[np.ndarray, "s p 3"], Float[np.ndarray, "s p 3"]],
+    transforms: Float[np.ndarray, "s 4 4"],
+    key: PRNGKeyArray,
+    *,
+    config: PairConfig,
+    batch: int,
+) -> Iterator[tuple[Pair, int]]:
+    """As `pair_batches`, of given sources and references in the pose that `transforms` says."""
+    source, target = clouds
+    for start in range(0, len(source), batch):
+        numbers = np.arange(start, start + batch) % len(source)
+        matrices = transforms[numbers].astype(source.dtype)
+        chosen = (jnp.asarray(numbers), source[numbers], target[numbers], matrices)
+        yield _given_batch_jit(key, *chosen, config=config), min(batch, len(source) - start)
 
 
 def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:
@@ -120,6 +154,29 @@ def icp_method(pair: Pair) -> RigidTransform:
         reference_mask=reference.mask,
     )
     return jax.vmap(one)(pair.source, pair.reference)
+
+
+def refined_method(method: Method, config: RefineConfig) -> Method:
+    """`method`, then a refinement of its poses by the ICP family (both clouds, nothing learned)."""
+    options = {
+        name: getattr(config, name)
+        for name in ("iterations", "max_distance", "trim", "kernel", "anneal", "both_directions")
+    }
+    match config.method:
+        case "icp":
+            refine = icp
+        case "point_to_plane":
+            refine, options = point_to_plane, options | {"neighbors": config.neighbors}
+        case "gicp":
+            own = {"neighbors": config.neighbors, "thickness": config.thickness}
+            refine, options = gicp, options | own
+
+    def one(source, reference, initial):
+        masks = {"source_mask": source.mask, "reference_mask": reference.mask}
+        return refine(source.points, reference.points, initial=initial, **masks, **options)
+
+    refine_batch = jit(jax.vmap(one))
+    return lambda pair: refine_batch(pair.source, pair.reference, method(pair))
 
 
 def host_method(

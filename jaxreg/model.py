@@ -28,7 +28,7 @@ from jaxreg.matching import (
 )
 from jaxreg.neighbors import knn, without_padding
 from jaxreg.numerics import safe_sqrt
-from jaxreg.procrustes import weighted_procrustes
+from jaxreg.procrustes import robust_procrustes
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
 Variables = dict[str, Any]
@@ -177,7 +177,7 @@ def _solve(source, copy, confidence, inliers, mask, config: ModelConfig) -> Rigi
     weights = jnp.where(mask, confidence, 0)
     if config.svd == "top":
         source, copy, weights = source[inliers], copy[inliers], weights[inliers]
-    return weighted_procrustes(source, copy, weights)
+    return robust_procrustes(source, copy, weights, rounds=config.robust_rounds)
 
 
 def iterate(

@@ -62,7 +62,7 @@ def plot_pair(
     for column, (name, clouds) in enumerate(panels.items()):
         grid[0, column].set_title(name)
         for axes, view in zip(grid[:, column], _VIEWS_DEG, strict=True):
-            _draw(axes, clouds, view, _project(everything, view))
+            draw_clouds(axes, clouds, view, project(everything, view))
     if confident is not None:
         figure.colorbar(ScalarMappable(cmap="viridis"), ax=grid[:, -1], shrink=0.4)
     described = "" if title and truth is None else _describe(transform, truth)
@@ -73,18 +73,18 @@ def plot_pair(
     figure.savefig(path, dpi=150, facecolor="white")
 
 
-def _project(points: np.ndarray, view: tuple[float, float]) -> np.ndarray:
+def project(points: np.ndarray, view: tuple[float, float]) -> np.ndarray:
     """Coordinates to the right, upwards and towards the eye, in an orthographic view."""
     elevation, azimuth = np.radians(view)
     (se, ce), (sa, ca) = (np.sin(elevation), np.cos(elevation)), (np.sin(azimuth), np.cos(azimuth))
     return points @ np.array([[-sa, ca, 0], [-se * ca, -se * sa, ce], [ce * ca, ce * sa, se]]).T
 
 
-def _draw(axes: Axes, clouds: list, view: tuple[float, float], limits: np.ndarray) -> None:
+def draw_clouds(axes: Axes, clouds: list, view: tuple[float, float], limits: np.ndarray) -> None:
     """Scatter clouds with their colours, far points first; `limits` are projected points."""
     low, high = limits.min(axis=0), limits.max(axis=0)
     extent = np.maximum(high - low, np.finfo(float).tiny)
-    points = _project(np.concatenate([cloud for cloud, _ in clouds]), view)
+    points = project(np.concatenate([cloud for cloud, _ in clouds]), view)
     colors = np.concatenate([np.broadcast_to(color, cloud.shape) for cloud, color in clouds])
     near = (points[:, 2] - low[2]) / extent[2]
     # A point of the first cloud shows as a rim behind a point of the second that it coincides with.

@@ -13,12 +13,15 @@ import jax
 import numpy as np
 
 from jaxreg import classical, evaluation, metrics, report
-from jaxreg.config import Config
-from jaxreg.data import load_shapes, pair_sizes
+from jaxreg.config import Config, RefineConfig
+from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.predecessor import load_predecessor
 from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.training import load_checkpoint, shape_points
 from jaxreg.types import Pair, RigidTransform
+
+_REFINEMENTS = ("icp", "point_to_plane", "gicp")
+_AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
 
 
 def choose_method(name: str) -> evaluation.Method:
@@ -38,7 +41,8 @@ def choose_method(name: str) -> evaluation.Method:
 def _network(config: Config, checkpoint: str, predecessor: str) -> tuple[str, evaluation.Method]:
     """A trained network with the architecture it was trained with.
 
-    What costs nothing to change after training, the iterations and N_c, follows `config`.
+    What costs nothing to change after training follows `config`: the iterations, N_c and the
+    robust rounds of the Procrustes.
     """
     if predecessor:
         label, (variables, trained) = "predecessor", load_predecessor(predecessor)
@@ -46,9 +50,8 @@ def _network(config: Config, checkpoint: str, predecessor: str) -> tuple[str, ev
         label, (variables, trained) = f"checkpoint {checkpoint}", load_checkpoint(checkpoint)
     else:
         label, (variables, trained) = f"jaxreg ({config.weights})", load_pretrained(config.weights)
-    model = dataclasses.replace(
-        trained.model, iterations=config.model.iterations, n_inliers=config.model.n_inliers
-    )
+    chosen = {name: getattr(config.model, name) for name in _AFTER_TRAINING}
+    model = dataclasses.replace(trained.model, **chosen)
     return label, evaluation.network_method(variables, model)
 
 
@@ -58,15 +61,35 @@ def pair_stream(
     """The number of test pairs, and the pairs in batches; `pairs` takes the first so many.
 
     Raises:
-      ValueError: the data is missing or malformed, or the sizes of the pairs do not fit it.
+      ValueError: the data is missing or malformed, it comes without pairs although `config` wants
+        those, or the sizes of the pairs do not fit it.
     """
+    key = evaluation.test_key(config.data.test_seed)
+    if config.data.test_pairs_from == "file":
+        source, target, transforms = _file_pairs(config, root, pairs)
+        batches = evaluation.given_pair_batches(
+            (source, target),
+            transforms,
+            key,
+            config=config.test_pairs,
+            batch=min(batch, len(source)),
+        )
+        return len(source), batches
     points = shape_points(config.test_pairs)
     shapes, _ = load_shapes(config.data, "test", root=root, points=points)
     pair_sizes(config.test_pairs, shapes.shape[1])
     shapes = shapes[: pairs or None]
-    key = evaluation.test_key(config.data.test_seed)
     batch = min(batch, len(shapes))
     return len(shapes), evaluation.pair_batches(shapes, key, config=config.test_pairs, batch=batch)
+
+
+def _file_pairs(config: Config, root: str | Path | None, pairs: int) -> tuple[np.ndarray, ...]:
+    if config.data.name != "icl_nuim" or root is None:
+        raise ValueError(
+            f"data.test_pairs_from = 'file' needs data.name = 'icl_nuim' (got '{config.data.name}') "
+            "and its folder: give --data-root or set $JAXREG_DATA."
+        )
+    return tuple(array[: pairs or None] for array in icl_nuim.load_pairs(root))
 
 
 def score(
@@ -77,6 +100,7 @@ def score(
     predecessor: str = "",
     method: str = "",
     transforms: str = "",
+    refine: str = "",
     pairs: int = 0,
     batch: int = 8,
     save_transforms: str = "",
@@ -84,15 +108,18 @@ def score(
     """Evaluate one method on the test pairs of `config`; returns the figures, in degrees.
 
     One of `checkpoint`, `predecessor` (its weights file), `method` and `transforms` chooses it; with
-    none of them it is the released weights that `config` names.
+    none of them it is the released weights that `config` names. `refine` (icp, point_to_plane or
+    gicp, with the defaults of `RefineConfig`) improves its poses on the clouds afterwards.
 
     Raises:
-      ValueError: more than one method is chosen, or none; missing data, weights or files.
+      ValueError: more than one method is chosen, or none; an unknown refinement, or one of given
+        transforms; missing data, weights or files.
     """
     chosen = [x for x in (checkpoint, predecessor, method, transforms) if x]
-    if len(chosen) > 1 or not (chosen or config.weights):
+    if len(chosen) > 1 or (transforms and refine) or not (chosen or config.weights):
         raise ValueError(
-            "choose one of --checkpoint, --predecessor, --method and --transforms; without any, "
+            "choose one of --checkpoint, --predecessor, --method and --transforms (which takes no "
+            "--refine); without any, "
             "--weights or the configuration must name released weights "
             f"({', '.join(available_weights())})."
         )
@@ -105,12 +132,22 @@ def score(
         label, function = (
             (method, choose_method(method)) if method else _network(config, checkpoint, predecessor)
         )
+        label, function = _refined(label, function, refine)
         with report.counting_progress(count, label) as progress:
             predicted, truth, seconds = evaluation.evaluate_method(function, batches, progress)
     if save_transforms:
         np.savez(save_transforms, **predicted._asdict())
     figures = metrics.evaluate_transforms(predicted, truth)
-    return {"method": label, "dataset": config.data.name} | figures | {"seconds_per_pair": seconds}
+    dataset = dataset_label(config.data, root)
+    return {"method": label, "dataset": dataset} | figures | {"seconds_per_pair": seconds}
+
+
+def _refined(label: str, function: evaluation.Method, refine: str) -> tuple[str, evaluation.Method]:
+    if not refine:
+        return label, function
+    if refine not in _REFINEMENTS:
+        raise ValueError(f"no refinement '{refine}': choose one of {', '.join(_REFINEMENTS)}.")
+    return f"{label} + {refine}", evaluation.refined_method(function, RefineConfig(method=refine))
 
 
 def _read_transforms(path: str, count: int) -> RigidTransform:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxreg import checkpoint, report
 from jaxreg.compilation import jit
 from jaxreg.config import Config, PairConfig, TrainConfig
-from jaxreg.data import load_shapes
+from jaxreg.data import dataset_label, load_shapes
 from jaxreg.data.pairs import make_pair
 from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
@@ -208,8 +208,13 @@ def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
         return run.best(create_train_state(config)).average, config
 
 
-def release(name: str, workdir: str | Path, command: str) -> None:
-    """Write the best weights of a run into the package, with a card of how they were made."""
+def release(
+    name: str, workdir: str | Path, command: str, *, root: str | Path | None = None
+) -> None:
+    """Write the best weights of a run into the package, with a card of how they were made.
+
+    The data is called by what is found in `root`, so that a stand-in is not taken for the original.
+    """
     variables, config = load_checkpoint(workdir)
     _, error = checkpoint.best_config(workdir)
     lines = (Path(workdir) / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
@@ -217,7 +222,7 @@ def release(name: str, workdir: str | Path, command: str) -> None:
     best = next(entry for entry in entries if entry.get("val_mie_r_deg") == error)
     card = {
         "command": command,
-        "data": f"{config.data.name}, training shapes: {config.data.train_categories}",
+        "data": f"{dataset_label(config.data, root)}, training shapes: {config.data.train_categories}",
         "seed": config.train.seed,
         "step": best["step"],
         "validation": {k.removeprefix("val_"): v for k, v in best.items() if k[:4] == "val_"},

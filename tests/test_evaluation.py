@@ -3,9 +3,10 @@
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxreg import evaluation
-from jaxreg.config import PairConfig
+from jaxreg.config import PairConfig, RefineConfig
 from jaxreg.types import RigidTransform
 
 pytestmark = pytest.mark.float32
@@ -78,3 +79,48 @@ def test_icp_undoes_a_small_motion(seed):
     predicted, truth, _ = evaluation.evaluate_method(evaluation.icp_method, stream)
     np.testing.assert_allclose(predicted.rotation, truth.rotation, atol=1e-4)
     np.testing.assert_allclose(predicted.translation, truth.translation, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["icp", "point_to_plane", "gicp"])
+def test_a_refinement_mends_poses_that_are_nearly_right(method, seed):
+    shapes = np.random.default_rng(seed).normal(size=(2, 64, 3)).astype(np.float32)
+    easy = PairConfig(points=64, kept=64, crop="none", rotation_max_deg=30.0)
+    stream = list(evaluation.pair_batches(shapes, evaluation.test_key(0), config=easy, batch=2))
+
+    def nearly(pair):
+        return pair.transform._replace(translation=pair.transform.translation + 0.02)
+
+    refined = evaluation.refined_method(nearly, RefineConfig(method=method))
+    for function, lowest, highest in ((nearly, 0.01, 0.1), (refined, 0, 1e-5)):
+        predicted, truth, _ = evaluation.evaluate_method(function, iter(stream))
+        error = np.abs(predicted.translation - truth.translation).max()
+        assert lowest <= error <= highest
+
+
+def test_given_pairs_keep_their_pose_and_are_cropped(seed):
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(3, 16, 3)).astype(np.float32)
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    matrices[:, :3, :3] = Rotation.random(3, rng=rng).as_matrix()
+    matrices[:, :3, 3] = rng.normal(size=(3, 3))
+    target = np.einsum("nij,npj->npi", matrices[:, :3, :3], source) + matrices[:, None, :3, 3]
+    config = PairConfig(kept=12)
+    counted = list(
+        evaluation.given_pair_batches(
+            (source, target.astype(np.float32)),
+            matrices,
+            evaluation.test_key(0),
+            config=config,
+            batch=2,
+        )
+    )
+    assert [count for _, count in counted] == [2, 1]
+    truth = evaluation.true_transforms(iter(counted))
+    np.testing.assert_allclose(truth.rotation, matrices[:, :3, :3], atol=1e-6)
+    np.testing.assert_allclose(truth.translation, matrices[:, :3, 3], atol=1e-6)
+    pair, _ = counted[0]
+    for number in range(2):
+        for cloud, points in ((source[number], pair.source), (target[number], pair.reference)):
+            distance = np.linalg.norm(cloud[:, None] - np.asarray(points.points)[number], axis=2)
+            assert points.points.shape[1] == 12
+            assert distance.min(axis=0).max() < 1e-5

@@ -15,6 +15,9 @@ weighted_procrustes = jax.jit(procrustes.weighted_procrustes)
 special_procrustes = jax.jit(procrustes.special_procrustes)
 
 
+robust_procrustes = jax.jit(procrustes.robust_procrustes, static_argnames="rounds")
+
+
 @jax.jit
 def derivative_along(covariance, direction):
     return jax.jvp(procrustes.special_procrustes, (covariance,), (direction,))[1]
@@ -286,6 +289,75 @@ def test_derivatives_scale_with_the_clouds(rng, scale):
     expected = gradient(source, reference, weights)
     scaled = gradient(scale * source, scale * reference, weights) * scale
     np.testing.assert_allclose(scaled, expected, rtol=1e-9, atol=1e-12)
+
+
+def with_wrong_pairs(rng, n=60, wrong=9, noise=0.0):
+    """A thin cloud, most of it moved, and some pairs that are far off."""
+    source = rng.normal(size=(n, 3)) * (0.1, 0.1, 1.0)
+    truth, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    reference = source @ truth.T + shift + noise * rng.normal(size=(n, 3))
+    reference[:wrong] += rng.normal(size=(wrong, 3))
+    return source, reference, rng.uniform(0.5, 1, n), truth, shift
+
+
+def test_robust_rounds_take_the_pull_from_wrong_pairs(rng):
+    source, reference, weights, truth, shift = with_wrong_pairs(rng)
+    plain = weighted_procrustes(source, reference, weights)
+    assert np.abs(plain.rotation - truth).max() > 1e-2
+    robust = robust_procrustes(source, reference, weights, rounds=40)
+    np.testing.assert_allclose(robust.rotation, truth, atol=1e-8)
+    np.testing.assert_allclose(robust.translation, shift, atol=1e-8)
+
+
+def test_robust_procrustes_minimises_the_geman_mcclure_cost_by_scipy(rng):
+    # Iterated to its end it is a stationary point of the robust cost at the last width.
+    source, reference, weights, *_ = with_wrong_pairs(rng, noise=0.02)
+    found = robust_procrustes(source, reference, weights, rounds=40)
+    residual = np.linalg.norm(source @ found.rotation.T + found.translation - reference, axis=1)
+    width = 3 * np.sort(residual)[(len(residual) - 1) // 2]
+    forgiving = weights * (width**2 / (width**2 + residual**2)) ** 2
+    share = (forgiving / forgiving.sum())[:, None]
+    x, y = source - (share * source).sum(axis=0), reference - (share * reference).sum(axis=0)
+    expected, _ = Rotation.align_vectors(y, x, weights=forgiving)
+    np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-6)
+
+
+def test_without_rounds_or_without_weights_the_robust_solution_is_the_plain_one(rng):
+    source, reference, weights = noisy_problem(rng)
+    plain = weighted_procrustes(source, reference, weights)
+    robust = robust_procrustes(source, reference, weights, rounds=0)
+    np.testing.assert_allclose(robust.rotation, plain.rotation, atol=1e-12)
+    nothing = robust_procrustes(source, reference, np.zeros(20), rounds=3)
+    np.testing.assert_allclose(nothing.rotation, np.eye(3), atol=1e-12)
+
+
+def test_padded_pairs_do_not_move_the_robust_solution(rng):
+    source, reference, weights, *_ = with_wrong_pairs(rng, noise=0.02)
+    padded = [np.concatenate([x, np.full((30, 3), 0.7)]) for x in (source, reference)]
+    solve = functools.partial(robust_procrustes, rounds=3)
+    expected = solve(source, reference, weights)
+    found = solve(*padded, np.concatenate([weights, np.zeros(30)]))
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-10)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_the_robust_derivative_equals_finite_differences(rng, exact):
+    source, reference, weights, *_ = with_wrong_pairs(rng, n=12, wrong=2, noise=0.05)
+    if exact:
+        reference = source + 1.0
+    source, reference, weights = map(jnp.asarray, (source, reference, weights))
+
+    def turn(source):
+        return robust_procrustes(source, reference, weights, rounds=2).rotation[0, 1]
+
+    gradient = jax.jit(jax.grad(turn))(source)
+    assert np.isfinite(gradient).all()
+    if not exact:
+        direction = rng.normal(size=source.shape)
+        [difference] = oracles.directional_difference(
+            lambda x: [jax.jit(turn)(x[0])], [source], [direction]
+        )
+        assert np.sum(gradient * direction) == pytest.approx(float(difference), abs=1e-6)
 
 
 @pytest.mark.untyped

@@ -1,5 +1,6 @@
 """One score for every method: names, files of transforms, and what is refused."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -7,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxreg import scoring
-from jaxreg.config import from_dict
+from jaxreg.config import PairConfig, from_dict
+from tests.data.test_icl_nuim import write_published
 
 pytestmark = pytest.mark.float32
 
@@ -54,6 +57,8 @@ def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
         ({"method": "icp", "checkpoint": "x"}, "choose one of"),
         ({}, "choose one of"),
         ({"method": "magic"}, "magic"),
+        ({"method": "icp", "refine": "magic"}, "no refinement 'magic': choose one of icp"),
+        ({"transforms": "x.npz", "refine": "icp"}, "which takes no --refine"),
         ({"transforms": "nowhere.npz"}, "nowhere.npz must be an NPZ file"),
         ({"checkpoint": "nowhere"}, "no checkpoint in nowhere"),
     ],
@@ -67,6 +72,28 @@ def test_transforms_of_the_wrong_number_are_refused(config, tmp_path):
     np.savez(tmp_path / "two.npz", rotation=np.zeros((2, 3, 3)), translation=np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"3 pairs need rotation \(3, 3, 3\)"):
         scoring.score(config, transforms=str(tmp_path / "two.npz"))
+
+
+def test_a_refined_method_says_so_and_is_better(config):
+    easy = dataclasses.replace(config, test_pairs=PairConfig(32, crop="none", rotation_max_deg=3))
+    plain, refined = (
+        scoring.score(easy, method="identity", refine=refine) for refine in ("", "icp")
+    )
+    assert refined["method"] == "identity + icp"
+    assert refined["mie_r_deg"] < plain["mie_r_deg"]
+
+
+def test_pairs_of_a_file_are_scored_in_their_own_pose(tmp_path):
+    arrays = write_published(tmp_path / "rooms", points=40)
+    config = from_dict(
+        {"data": {"name": "icl_nuim", "test_pairs_from": "file"}, "test_pairs": {"kept": 30}}
+    )
+    result = scoring.score(config, root=tmp_path, method="identity", pairs=4)
+    angles = np.degrees(Rotation.from_matrix(arrays["transform"][:4, :3, :3]).magnitude())
+    assert (result["dataset"], result["pairs"]) == ("rooms", 4)
+    assert result["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-5)
+    with pytest.raises(ValueError, match="needs data.name = 'icl_nuim'"):
+        scoring.score(from_dict({"data": {"test_pairs_from": "file"}}), method="icp")
 
 
 def run(script, *arguments):

@@ -11,7 +11,15 @@ from jaxreg.config import DataConfig
 from jaxreg.data import folder, icl_nuim, modelnet, seven_scenes, shapes
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
 
-__all__ = ["Split", "data_root", "load_shapes", "make_pair", "make_pair_from_scans", "pair_sizes"]
+__all__ = [
+    "Split",
+    "data_root",
+    "dataset_label",
+    "load_shapes",
+    "make_pair",
+    "make_pair_from_scans",
+    "pair_sizes",
+]
 
 Split = Literal["train", "validation", "test"]
 
@@ -71,8 +79,25 @@ def load_shapes(
     clouds, labels = _load_files(config, "test" if split == "test" else "train", root, points, seed)
     if split == "test":
         return clouds, labels
-    chosen = _held_out(len(clouds), config.validation_share, seed) == (split == "validation")
+    # By fragment, so that no draw of a validated fragment is trained on.
+    draws = config.train_draws if config.name == "seven_scenes" else 1
+    held_out = np.repeat(_held_out(len(clouds) // draws, config.validation_share, seed), draws)
+    chosen = held_out == (split == "validation")
     return clouds[chosen], labels[chosen]
+
+
+def dataset_label(config: DataConfig, root: str | Path | None) -> str:
+    """What figures call the test data: `config.label`, else by what is found in `root`.
+
+    A stand-in is called one, so that its figures never pass for those of the published data.
+
+    Raises:
+      ValueError: the data is missing.
+    """
+    if config.label or root is None:
+        return config.label or config.name
+    sources = {"icl_nuim": icl_nuim, "seven_scenes": seven_scenes}
+    return sources[config.name].label(root) if config.name in sources else config.name
 
 
 def _load_procedural(
@@ -107,7 +132,10 @@ def _load_files(
         stand_in = seven_scenes.TEST_SCENE not in seven_scenes.find_scenes(root)
         if stand_in:
             warnings.warn(seven_scenes.describe(root), stacklevel=3)
-        return seven_scenes.load(root, split, points=points, stand_in=stand_in, seed=seed)
+        draws = config.train_draws if split == "train" else config.test_draws
+        return seven_scenes.load(
+            root, split, points=points, draws=draws, stand_in=stand_in, seed=seed
+        )
     raise ValueError(
         "data.name must be 'modelnet40', 'shapes', 'folder', 'seven_scenes' or 'icl_nuim', "
         f"got {config.name!r}."

@@ -60,6 +60,16 @@ def load_pairs(root: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return source, target, transform
 
 
+def label(root: str | Path) -> str:
+    """What figures on the test data found in `root` are to be called: the name of its folder.
+
+    A set in the form of ICL-NUIM that is not ICL-NUIM is told apart by the folder it came in; files
+    that lie in `root` itself are taken for ICL-NUIM.
+    """
+    folder = find_file(root, "test").parent.parent
+    return "icl_nuim" if folder == Path(root) else folder.name
+
+
 def find_file(root: str | Path, split: Literal["train", "test"]) -> Path:
     """The HDF5 file of a split below `root`: nearest first, then by name.
 

@@ -87,11 +87,16 @@ def make_pair(
 
 
 def make_pair_from_scans(
-    key: PRNGKeyArray, source: PointCloud, reference: PointCloud, config: PairConfig
+    key: PRNGKeyArray,
+    source: PointCloud,
+    reference: PointCloud,
+    config: PairConfig,
+    transform: RigidTransform | None = None,
 ) -> Pair:
     """`make_pair` for two given clouds in one frame, such as two scans that are aligned already.
 
-    `points` and `sampling` are not used: all points go to the crop.
+    The reference is moved by `transform`, or by a drawn one. `points` and `sampling` are not used:
+    all points go to the crop.
 
     Raises:
       ValueError: `kept` is larger than one of the clouds, or `outliers` is negative.
@@ -101,12 +106,19 @@ def make_pair_from_scans(
     keys = _split(key)
     source = source._replace(points=without_padding(*source))
     reference = reference._replace(points=without_padding(*reference))
-    return _move_and_crop(keys, source, reference, config)
+    return _move_and_crop(keys, source, reference, config, transform)
 
 
-def _move_and_crop(keys: _Keys, source: PointCloud, still: PointCloud, config: PairConfig) -> Pair:
+def _move_and_crop(
+    keys: _Keys,
+    source: PointCloud,
+    still: PointCloud,
+    config: PairConfig,
+    transform: RigidTransform | None = None,
+) -> Pair:
     """The pair of two clouds in one frame; `still` is the reference before its motion."""
-    transform = _draw_transform(keys, config, source.points.dtype)
+    if transform is None:
+        transform = _draw_transform(keys, config, source.points.dtype)
     reference = still._replace(points=rigid.apply(transform, still.points))
     scores = _crop_scores(keys, source, still, reference, config)
     source = _finish(keys.source, source, scores[0], config)

@@ -55,27 +55,37 @@ def describe(root: str | Path) -> str:
     return text
 
 
+def label(root: str | Path) -> str:
+    """What figures on the test data found in `root` are to be called."""
+    scenes = find_scenes(root)
+    if TEST_SCENE in scenes:
+        return "seven_scenes"
+    return f"seven_scenes stand-in ({', '.join(scenes)})"
+
+
 def load(
     root: str | Path,
     split: Literal["train", "test"],
     *,
     points: int,
+    draws: int = 1,
     stand_in: bool = False,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, points, 3) float32 and labels (n,) int32, the index of the scene in `SCENES`.
 
-    Each fragment is divided by its largest bounding-box side, freed of its mean and resampled:
-    drawn without replacement, or with it where the fragment is smaller. `train` is every scene
+    Each fragment is divided by its largest bounding-box side, freed of its mean and resampled
+    `draws` times, one after the other in the result: drawn without replacement, or with it where
+    the fragment is smaller. `train` is every scene
     present but office, `test` is office; with `stand_in` see the head of this file.
 
     Raises:
       ValueError: an unknown split, no scene for it, or a malformed file (file, row, remedy).
     """
     chosen = split_files(root, split, stand_in=stand_in)
-    clouds = [_resampled(path, points, (seed, i)) for i, (_, path) in enumerate(chosen)]
-    labels = [SCENES.index(scene) for scene, _ in chosen]
-    return np.stack(clouds), np.array(labels, np.int32)
+    clouds = [_resampled(path, points, draws, (seed, i)) for i, (_, path) in enumerate(chosen)]
+    labels = np.array([SCENES.index(scene) for scene, _ in chosen], np.int32)
+    return np.concatenate(clouds), np.repeat(labels, draws)
 
 
 def split_files(
@@ -135,14 +145,16 @@ def read_pose(path: Path) -> np.ndarray:
         ) from None
 
 
-def _resampled(path: Path, points: int, seed: tuple[int, int]) -> np.ndarray:
+def _resampled(path: Path, points: int, draws: int, seed: tuple[int, int]) -> np.ndarray:
     cloud = read_fragment(path)
     side = np.ptp(cloud, axis=0).max()
     if side == 0:
         raise ValueError(f"{path}: all points coincide: download it again, or remove it.")
     cloud = (cloud - cloud.mean(axis=0)) / side
     rng = np.random.default_rng(seed)
-    return cloud[rng.choice(len(cloud), points, replace=len(cloud) < points)].astype(np.float32)
+    fewer = len(cloud) < points
+    chosen = [rng.choice(len(cloud), points, replace=fewer) for _ in range(draws)]
+    return cloud[np.stack(chosen)].astype(np.float32)
 
 
 def _stand_in(files: list[Path], split: str) -> list[Path]:

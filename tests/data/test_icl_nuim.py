@@ -46,6 +46,14 @@ def test_the_transform_maps_source_to_target(tmp_path):
         np.testing.assert_allclose(moved, q, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("folder", "expected"), [(".", "icl_nuim"), ("icl_nuim", "icl_nuim"), ("mine", "mine")]
+)
+def test_figures_are_called_by_the_folder_of_the_files(folder, expected, tmp_path):
+    write_published(tmp_path / folder)
+    assert icl_nuim.label(tmp_path) == expected
+
+
 SCALED = np.tile(np.eye(4), (5, 1, 1))
 SCALED[3, :3, :3] *= 1.1
 MIRRORED = np.tile(np.eye(4), (5, 1, 1))

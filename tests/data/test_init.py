@@ -4,7 +4,7 @@ import pytest
 
 from jaxreg.config import DataConfig
 from jaxreg.data import data_root as find_root
-from jaxreg.data import load_shapes
+from jaxreg.data import dataset_label, load_shapes
 
 
 def write_modelnet(root, count=40, points=8):
@@ -107,10 +107,42 @@ def test_icl_nuim_and_the_stand_in_of_seven_scenes(tmp_path):
     head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     for i in range(10):
         (folder / f"cloud_bin_{i}.ply").write_text(f"{head}0 0 0\n1 2 {3 + i}\n")
-    config = DataConfig(name="seven_scenes")
-    for split, count in (("train", 7), ("validation", 1), ("test", 2)):
+    config = DataConfig(name="seven_scenes", train_draws=3, test_draws=2)
+    for split, count in (("train", 3 * 7), ("validation", 3 * 1), ("test", 2 * 2)):
         with pytest.warns(UserWarning, match="absent: fire.*stand-in split.*Label its figures"):
             assert len(load_shapes(config, split, root=tmp_path, points=8)[0]) == count
+
+
+def test_no_fragment_is_both_trained_on_and_validated(tmp_path):
+    folder = tmp_path / "7scene" / "7-scenes-chess"
+    folder.mkdir(parents=True)
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    for i in range(10):
+        (folder / f"cloud_bin_{i}.ply").write_text(f"{head}0 0 0\n1 {2 + i} {30 + i}\n")
+    (tmp_path / "7scene" / "7-scenes-office").mkdir()
+    (tmp_path / "7scene" / "7-scenes-office" / "cloud_bin_0.ply").write_text(
+        f"{head}0 0 0\n1 2 3\n"
+    )
+    config = DataConfig(name="seven_scenes", train_draws=4, validation_share=0.3)
+    extents = {
+        split: {
+            round(float(np.ptp(cloud[:, 1])), 6)
+            for cloud in load_shapes(config, split, root=tmp_path, points=2)[0]
+        }
+        for split in ("train", "validation")
+    }
+    assert (len(extents["train"]), len(extents["validation"])) == (7, 3)
+    assert not extents["train"] & extents["validation"]
+
+
+def test_the_label_of_the_test_data(tmp_path):
+    (tmp_path / "stand_in" / "test").mkdir(parents=True)
+    (tmp_path / "stand_in" / "test" / "icl_nuim.h5").touch()
+    assert dataset_label(DataConfig(name="icl_nuim"), tmp_path) == "stand_in"
+    assert dataset_label(DataConfig(name="icl_nuim", label="rooms"), tmp_path) == "rooms"
+    assert dataset_label(DataConfig(name="shapes"), None) == "shapes"
+    assert dataset_label(DataConfig(), tmp_path) == "modelnet40"
 
 
 def test_root_by_argument_then_environment_then_beside_the_config(tmp_path, monkeypatch):

@@ -73,6 +73,29 @@ def test_resampling_is_seeded(write_scenes, tmp_path):
     assert (one != other).any()
 
 
+def test_draws_of_a_fragment_stand_together_and_differ(write_scenes, tmp_path):
+    written = write_scenes("chess", fragments=2)
+    clouds, labels = seven_scenes.load(tmp_path, "train", points=200, draws=3)
+    assert clouds.shape == (6, 200, 3)
+    assert labels.shape == (6,)
+    for number in range(6):
+        cloud = written["chess", number // 3].astype(np.float64)
+        rows_of(clouds[number], (cloud - cloud.mean(axis=0)) / np.ptp(cloud, axis=0).max())
+    assert len({tuple(cloud[0]) for cloud in clouds}) == 6
+
+
+@pytest.mark.parametrize(
+    ("scenes", "expected"),
+    [
+        (("chess", "office"), "seven_scenes"),
+        (("chess", "stairs"), "seven_scenes stand-in (chess, stairs)"),
+    ],
+)
+def test_the_label_tells_a_stand_in(write_scenes, tmp_path, scenes, expected):
+    write_scenes(*scenes, fragments=1)
+    assert seven_scenes.label(tmp_path) == expected
+
+
 def test_absent_scenes_are_named_and_the_stand_in_is_offered(write_scenes, tmp_path):
     write_scenes("chess", "redkitchen")
     text = seven_scenes.describe(tmp_path)

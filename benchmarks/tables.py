@@ -1,0 +1,160 @@
+"""The paper's tables: every row that has weights, and the baselines, by one command.
+
+    python benchmarks/tables.py [--data-root DATA] [--predecessor rie_modelnet.npz] [--only COLUMN ...]
+
+Networks meet all pairs of a column, classical methods the first `--baseline-pairs`. A finished cell
+leaves FOLDER/COLUMN-ROW.json and is not made again unless `--again`; the tables are printed from
+these files. "+ icp" is the same network with a final refinement of its poses, the second of the two
+figures.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from jaxreg import scoring
+from jaxreg.compilation import enable_compilation_cache
+from jaxreg.config import Config, load_config
+from jaxreg.data import data_root
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+BASELINES = (
+    "identity",
+    "icp",
+    "open3d_icp",
+    "open3d_icp_coarse_to_fine",
+    "open3d_fgr",
+    "open3d_fgr_gicp",
+    "open3d_fpfh_ransac",
+    "open3d_ransac_gicp",
+    "small_gicp",
+)
+
+
+class Column(NamedTuple):
+    """One set of test pairs: a file in configs/, what deviates from it, the paper's MAE(R)."""
+
+    config: str
+    paper: str
+    draws: int = 1
+    from_file: bool = False
+    baselines: bool = True
+
+
+COLUMNS = {
+    "unseen_objects": Column("modelnet40_unseen_objects", "0.0006"),
+    "unseen_categories": Column("modelnet40_unseen_categories", "0.0007"),
+    "gaussian_noise": Column("modelnet40_gaussian_noise", "0.0006"),
+    "seven_scenes": Column("seven_scenes", "0.0036 on office", draws=64),
+    "icl_nuim": Column("icl_nuim", "0.0005 on ICL-NUIM"),
+    "icl_nuim_given_pairs": Column("icl_nuim", "none", from_file=True),
+    "unseen_objects_717": Column("modelnet40_unseen_objects_717", "none", baselines=False),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to evaluate."""
+
+    only: tuple[str, ...] = tuple(COLUMNS)
+    folder: str = "runs/tables"
+    pairs: int = 0
+    """Pairs of the networks; 0 is all."""
+    baseline_pairs: int = 256
+    predecessor: str = ""
+    """NPZ file with the predecessor's released weights."""
+    predecessor_pairs: int = 0
+    again: bool = False
+    data_root: str = ""
+
+
+def column_config(column: Column, root: Path | None) -> Config:
+    """The configuration of a column; a real test scene has one draw of each fragment."""
+    config = load_config(CONFIGS / f"{column.config}.toml")
+    stand_in = "stand-in" in scoring.dataset_label(config.data, root)
+    data = dataclasses.replace(
+        config.data,
+        test_draws=column.draws if stand_in else 1,
+        test_pairs_from="file" if column.from_file else "shapes",
+    )
+    return dataclasses.replace(config, data=data)
+
+
+def rows(column: Column, options: Options) -> dict[str, dict[str, Any]]:
+    """The rows of a column, by name, as options of `scoring.score`."""
+    found = {
+        "jaxreg": {"pairs": options.pairs},
+        "jaxreg + icp": {"pairs": options.pairs, "refine": "icp"},
+    }
+    if options.predecessor:
+        chosen = {"predecessor": options.predecessor, "pairs": options.predecessor_pairs}
+        found["predecessor's weights"] = chosen
+    if column.baselines:
+        for method in BASELINES:
+            found[method] = {"method": method, "pairs": options.baseline_pairs}
+    return found
+
+
+def evaluate(name: str, options: Options, root: Path | None) -> None:
+    """Make the cells of a column that are missing."""
+    column, folder = COLUMNS[name], Path(options.folder)
+    config = column_config(column, root)
+    for row, chosen in rows(column, options).items():
+        path = folder / f"{name}-{''.join(c if c.isalnum() else '_' for c in row)}.json"
+        if path.is_file() and not options.again:
+            continue
+        print(f"{name}: {row}", flush=True)
+        try:
+            result = scoring.score(config, root=root, **chosen)
+        except ValueError as error:  # Weights or a library that are not there.
+            print(f"  left out: {error}")
+            continue
+        path.write_text(json.dumps({"row": row, "config": column.config} | result, indent=1) + "\n")
+
+
+def table(name: str, options: Options) -> str:
+    """One column in Markdown, from the files of its cells."""
+    files = sorted(Path(options.folder).glob(f"{name}-*.json"))
+    results = {r["row"]: r for r in (json.loads(path.read_text("utf-8")) for path in files)}
+    order = rows(COLUMNS[name], dataclasses.replace(options, predecessor="x"))
+    head = ("row", "pairs", "MAE(R)", "MIE(R)", "printed MIE(R)", "median", "MAE(t)")
+    head += ("recall 1 deg", "worst (pair)", "s / pair")
+    lines = [head, ("---",) * len(head)]
+    for row in order:
+        if r := results.get(row):
+            figures = (
+                "mae_r_deg",
+                "mie_r_deg",
+                "mie_r_deg_float32_acos",
+                "median_rre_deg",
+                "mae_t",
+            )
+            numbers = tuple(f"{r[key]:.3g}" for key in figures)
+            worst = f"{r['worst_rre_deg']:.3g} ({r['worst_pair']})"
+            ends = (f"{r['recall_1deg']:.4f}", worst, f"{r['seconds_per_pair']:.3f}")
+            lines.append((row, str(r["pairs"]), *numbers, *ends))
+    dataset = next(iter(results.values()))["dataset"] if results else "nothing evaluated"
+    body = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f"\n{name} ({dataset}); the paper's MAE(R): {COLUMNS[name].paper}\n\n{body}"
+
+
+def main() -> None:
+    """Evaluate what is missing, print all."""
+    options = tyro.cli(Options, description=__doc__)
+    enable_compilation_cache()
+    root = data_root(options.data_root, CONFIGS / "any.toml")
+    Path(options.folder).mkdir(parents=True, exist_ok=True)
+    for name in options.only:
+        try:
+            evaluate(name, options, root)
+        except ValueError as error:  # Data that is not there.
+            print(f"{name} left out: {error}")
+    for name in options.only:
+        print(table(name, options))
+
+
+if __name__ == "__main__":
+    main()
