@@ -88,7 +88,7 @@ def neighborhood_sum(
         lambda x: x,
         scores,
         solve=lambda _, x: _gather_both(x, source, reference),
-        transpose_solve=lambda _, x: _two_passes(_collect, x, source, reference),
+        transpose_solve=lambda _, x: _two_passes(collect_rows, x, source, reference),
     )
 
 
@@ -124,10 +124,10 @@ def _gather_both(x: Float[Array, "n m"], source: Incidence, reference: Incidence
     if source.idx.shape[1] == reference.idx.shape[1] == 1:
         rows = x.at[source.idx[:, 0]].get(mode="promise_in_bounds")
         return rows.at[:, reference.idx[:, 0]].get(mode="promise_in_bounds")
-    return _two_passes(_gather, x, source, reference)
+    return _two_passes(gather_rows, x, source, reference)
 
 
-def _gather(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+def gather_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     """``A x``: sum of the rows of the neighbours."""
 
     # A loop, since XLA fuses nothing across its border: written out, whatever makes `x` would be
@@ -138,7 +138,7 @@ def _gather(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     return jax.lax.fori_loop(0, graph.idx.shape[1], add, jnp.zeros_like(x))
 
 
-def _collect(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
+def collect_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     """``A^T x``: sum of the rows of those that have this point as a neighbour."""
 
     def add(r, total):
@@ -204,7 +204,9 @@ def matching_maps(
     return Maps(scores, dual, matching_scores(final_distance(total, dual, alpha=alpha), valid))
 
 
-def match(maps: Maps, reference: Float[Array, "m 3"]) -> Matches:
-    """The reference copy ``q~_i = sum_j F[i, j] q_j`` (Eq. 6) and the peaks of the maps."""
-    copy = jnp.matmul(maps.final, reference, precision=Precision.HIGHEST)
-    return Matches(copy, _row_peak(maps.dual), _row_peak(maps.final))
+def match(
+    dual: Float[Array, "n m"], final: Float[Array, "n m"], reference: Float[Array, "m 3"]
+) -> Matches:
+    """The reference copy ``q~_i = sum_j F[i, j] q_j`` (Eq. 6) and the peaks of G and F."""
+    copy = jnp.matmul(final, reference, precision=Precision.HIGHEST)
+    return Matches(copy, _row_peak(dual), _row_peak(final))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxreg import rigid
+from jaxreg import matching_blocks, rigid
 from jaxreg.config import Config, ModelConfig
 from jaxreg.features import DGCNN, relative_neighbors
 from jaxreg.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
@@ -26,6 +26,7 @@ from jaxreg.matching import (
     neighborhood_sum,
     squared_feature_distance,
 )
+from jaxreg.matching_blocks import Branch, match_in_blocks
 from jaxreg.neighbors import knn, without_padding
 from jaxreg.numerics import safe_sqrt
 from jaxreg.procrustes import robust_procrustes
@@ -148,6 +149,10 @@ def _both_features(variables, points, graph, mask, config, train):
 
 
 def _match(source_features, reference_features, source_graph, reference_graph, reference, config):
+    if source_features[0].shape[0] * reference_features[0].shape[0] > matching_blocks.LARGEST:
+        features, graphs = (source_features, reference_features), (source_graph, reference_graph)
+        branches = _branches(features, graphs, config)
+        return match_in_blocks(branches, reference.points, alpha=config.alpha, valid=reference.mask)
     squared = squared_feature_distance(source_features[0], reference_features[0])
     distance = safe_sqrt(squared)
     nearest_distance, nearest_graphs = None, None
@@ -170,7 +175,22 @@ def _match(source_features, reference_features, source_graph, reference_graph, r
         nearest_graphs=nearest_graphs,
         valid=reference.mask,
     )
-    return match(maps, reference.points)
+    return match(maps.dual, maps.final, reference.points)
+
+
+def _branches(features, graphs, config: ModelConfig) -> tuple[Branch, ...]:
+    """The neighbourhoods that are matched: that of the points, and that of their nearest points."""
+    matching = [graph.matching for graph in graphs]
+    first = Branch(*(both[0] for both in features), *matching)
+    if config.one_nn == "none":
+        return (first,)
+    if config.one_nn == "own":
+        own = [graph.own.matching for graph in graphs]
+        return first, Branch(*(both[1] for both in features), *own)
+    if config.one_nn == "self":
+        return first, first
+    pairs = zip(features, graphs, strict=True)
+    return first, Branch(*(both[0][graph.nearest.idx[:, 0]] for both, graph in pairs), *matching)
 
 
 def _solve(source, copy, confidence, inliers, mask, config: ModelConfig) -> RigidTransform:

@@ -11,6 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.numerics import row_min
 
+_BLOCK = 2048
+"""Points whose distances to all others are held at once."""
+
 
 def squared_distances(
     points: Float[Array, "n 3"], others: Float[Array, "m 3"]
@@ -49,17 +52,25 @@ def knn(
         )
     points = jax.lax.stop_gradient(without_padding(points, mask))
     order = jnp.lexsort(points.T)
-    distance = squared_distances(points, points[order])
-    excluded = order[None, :] == jnp.arange(n)[:, None]
-    if mask is not None:
-        excluded = excluded | ~mask[order][None, :]
-    # The barrier keeps XLA from merging later slices into the call, which would turn the
-    # fast selection into a full sort of every row.
-    negative, column = jax.lax.optimization_barrier(
-        jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
-    )
-    index = jnp.where(jnp.isneginf(negative), jnp.arange(n)[:, None], order[column])
-    return index.astype(jnp.int32)
+    candidates, row = points[order], jnp.arange(n, dtype=order.dtype)
+
+    def of_rows(row):
+        distance = squared_distances(points[row], candidates)
+        excluded = order[None, :] == row[:, None]
+        if mask is not None:
+            excluded = excluded | ~mask[order][None, :]
+        negative, column = jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
+        return jnp.where(jnp.isneginf(negative), row[:, None], order[column])
+
+    if n <= _BLOCK:
+        index = of_rows(row)
+    else:
+        # Rows in blocks, since all distances of a large cloud at once would fill the memory.
+        blocks = jnp.pad(row, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
+        index = jax.lax.map(of_rows, blocks).reshape(-1, k)[:n]
+    # The barrier keeps XLA from merging later slices into the selection, which would turn the
+    # fast call into a full sort of every row.
+    return jax.lax.optimization_barrier(index.astype(jnp.int32))
 
 
 def nearest_neighbor(

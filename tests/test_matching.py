@@ -144,7 +144,7 @@ def test_maps_entry_by_entry(rng, nearest):
 def test_reference_copy_is_the_weighted_mean_of_the_reference(rng):
     maps = matching.Maps(*(oracles.softmax_rows(rng.normal(size=(3, N, M)))))
     reference = rng.normal(size=(M, 3))
-    matches = jax.jit(matching.match)(maps, reference)
+    matches = jax.jit(matching.match)(maps.dual, maps.final, reference)
     expected = [sum(maps.final[i, j] * reference[j] for j in range(M)) for i in range(N)]
     np.testing.assert_allclose(matches.copy, expected, atol=1e-14)
     np.testing.assert_array_equal(matches.dual_peak, maps.dual.max(axis=1))

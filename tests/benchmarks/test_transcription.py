@@ -71,7 +71,9 @@ def test_gradient_of_the_loss_is_that_of_the_equations(rng):
     config = Config(model=SMALL)
     variables = variables_of(SMALL)
     arguments = variables["params"], variables["batch_stats"]
-    sources, references = (np.stack(x) for x in zip(*[draw_pair(rng, 24, 20) for _ in range(2)]))
+    sources, references = (
+        np.stack(x) for x in zip(*[draw_pair(rng, 24, 20) for _ in range(2)], strict=True)
+    )
     clouds = [PointCloud(x, np.ones(x.shape[:2], bool)) for x in (sources, references)]
     pairs = Pair(*clouds, RigidTransform(np.zeros((2, 3, 3)), np.zeros((2, 3))))
     ours, written = (
