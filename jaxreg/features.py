@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.numerics import leading_max
+
 BATCH_AXIS = "batch"
 """Name of the `vmap` axis over which BatchNorm takes its statistics while training."""
 
@@ -101,6 +103,6 @@ class DGCNN(nn.Module):
         for channels in self.channels:
             x = nn.Dense(channels, use_bias=False)(x)
             x = jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask[None, :], train=train))
-            pooled.append(jnp.max(x, axis=0))
+            pooled.append(leading_max(x))
         x = nn.Dense(self.width, use_bias=False)(jnp.concatenate(pooled, axis=-1))
         return jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask, train=train))

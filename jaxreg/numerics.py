@@ -22,6 +22,19 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     return safe_sqrt(jnp.sum(x * x, axis=axis))
 
 
+def leading_max(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
+    """Maximum over the first axis; equal entries share its derivative.
+
+    The derivative of `jnp.max` divides by the number of entries that equal the maximum. Where XLA
+    computes those entries anew, in another kernel, they may differ from it in the last bit: none is
+    equal, and the derivative is NaN. Here two entries at a time are compared, and one always wins.
+    """
+    while x.shape[0] > 1:
+        half = (x.shape[0] + 1) // 2  # The halves of an odd number of entries overlap.
+        x = jnp.maximum(x[:half], x[x.shape[0] - half :])
+    return x[0]
+
+
 def _unit_scale(x: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """`x` with its largest coordinate at magnitude 1, so that no square under- or overflows."""
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))

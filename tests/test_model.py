@@ -28,7 +28,8 @@ READINGS = {
     "self 1-NN": {"one_nn": "self"},
     "single neighbourhood": {"one_nn": "none", "svd": "all"},
     "lengths, next angle": {"edge": "length", "angles": "next"},
-    "raw coordinates": {"edge": "coordinates", "angles": "none"},
+    # All points: two with the same neighbours have equal confidence, in any order.
+    "raw coordinates": {"edge": "coordinates", "angles": "none", "svd": "all"},
     "with the point itself": {"include_self": True},
 }
 graph_of = jax.jit(knn, static_argnums=1)

@@ -97,3 +97,14 @@ def test_second_derivative_of_the_angle_equals_differences_of_the_first(seed):
     gradient = jax.jit(jax.grad(included_angle))
     [difference] = oracles.directional_difference(lambda x: [gradient(x[0], v)], [u], [direction])
     np.testing.assert_allclose(second, difference, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8, 20])
+def test_leading_max_is_numpy_s_and_hands_its_derivative_to_the_largest(count, seed):
+    x = np.random.default_rng(seed).normal(size=(count, 6))
+    np.testing.assert_array_equal(jax.jit(numerics.leading_max)(x), x.max(axis=0))
+    gradient = jax.grad(lambda x: numerics.leading_max(x).sum())(jnp.asarray(x))
+    np.testing.assert_array_equal(gradient, (x == x.max(axis=0)).astype(float))
+    x[-1] = x[0] = 9.0
+    gradient = jax.grad(lambda x: numerics.leading_max(x).sum())(jnp.asarray(x))
+    np.testing.assert_allclose(gradient[0] + gradient[-1] * (count > 1), 1.0, rtol=1e-15)
