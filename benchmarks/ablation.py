@@ -25,6 +25,7 @@ from jaxreg.training import train
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 FULL = {"model.n_inliers": 64, "pairs.points": 256, "pairs.kept": 192}
 """Of the configuration for unseen objects, what a small budget changes: the size of the crops."""
+TEST = {"points": 512, "kept": 384}
 ROWS: dict[str, dict[str, Any]] = {
     "full": {},
     "without geometric invariants": {
@@ -58,7 +59,7 @@ ROWS: dict[str, dict[str, Any]] = {
         "loss.l_sc": "F",
     },
 }
-COLUMNS = {"clean": "modelnet40_unseen_objects", "200 outliers": "modelnet40_gaussian_noise"}
+COLUMNS = {"clean": "modelnet40_unseen_objects", "100 outliers": "modelnet40_gaussian_noise"}
 FIGURES = ("mae_r_deg", "recall_1deg", "worst_rre_deg")
 
 
@@ -68,7 +69,7 @@ class Options:
 
     workdir: str = "runs/ablation"
     seeds: int = 3
-    steps: int = 150
+    steps: int = 120
     pairs: int = 64
     """Test pairs of each column."""
     rows: tuple[str, ...] = tuple(ROWS)
@@ -80,9 +81,10 @@ class Options:
 def row_config(row: str, seed: int, steps: int) -> Config:
     """The configuration that a row is trained with: validated once, at its end."""
     base = flatten_dict(to_dict(load_config(CONFIGS / f"{COLUMNS['clean']}.toml")), sep=".")
-    budget = {"train.steps": steps, "train.validate_every": steps, "train.validation_pairs": 16}
+    small = {f"test_pairs.{name}": value for name, value in TEST.items()}
+    budget = {"train.steps": steps, "train.validate_every": steps, "train.validation_pairs": 8}
     return from_dict(
-        unflatten_dict(base | FULL | budget | {"train.seed": seed} | ROWS[row], sep=".")
+        unflatten_dict(base | FULL | budget | {"train.seed": seed} | small | ROWS[row], sep=".")
     )
 
 
@@ -91,7 +93,11 @@ def evaluate(workdir: Path, root: Path | None, pairs: int) -> dict[str, dict[str
     figures = {}
     for column, name in COLUMNS.items():
         config = load_config(CONFIGS / f"{name}.toml")
-        config = dataclasses.replace(config, model=Config().model)
+        test_pairs = dataclasses.replace(config.test_pairs, **TEST)
+        if test_pairs.outliers:
+            test_pairs = dataclasses.replace(test_pairs, outliers=100)
+        model = dataclasses.replace(Config().model, n_inliers=128)
+        config = dataclasses.replace(config, model=model, test_pairs=test_pairs)
         result = scoring.score(config, root=root, checkpoint=str(workdir), pairs=pairs)
         figures[column] = {key: result[key] for key in FIGURES}
     return figures
