@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxreg.compilation import enable_compilation_cache
+from jaxreg.compilation import enable_compilation_cache, restart_with_huge_pages
 from jaxreg.config import Config
 from jaxreg.data import data_root
 from jaxreg.options import parse
@@ -49,4 +49,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    restart_with_huge_pages()
     main()

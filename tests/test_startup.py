@@ -3,6 +3,7 @@
 Each of them takes a tenth of a second to two seconds; a clock would measure the machine instead.
 """
 
+import os
 import subprocess
 import sys
 
@@ -38,3 +39,27 @@ def test_the_list_is_of_modules_that_exist_here():
 )
 def test_start_is_lean(code, unneeded):
     assert loaded_by(code) & unneeded == set()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="huge pages are asked of glibc")
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("", "glibc.malloc.hugetlb=1"),
+        ("glibc.malloc.perturb=0", "glibc.malloc.perturb=0:glibc.malloc.hugetlb=1"),
+        ("glibc.malloc.hugetlb=0", "glibc.malloc.hugetlb=0"),
+    ],
+)
+def test_a_restart_for_huge_pages_keeps_settings_and_arguments(given, expected):
+    program = (
+        "import os, sys; from jaxreg.compilation import restart_with_huge_pages\n"
+        "restart_with_huge_pages(); print(os.environ['GLIBC_TUNABLES'], sys.argv[1:])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "--steps", "two words"],
+        env=os.environ | {"GLIBC_TUNABLES": given},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == f"{expected} ['--steps', 'two words']\n"
