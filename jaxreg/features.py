@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.cpu import gradient_written_out
 from jaxreg.numerics import leading_max
 
 BATCH_AXIS = "batch"
@@ -101,8 +102,9 @@ class DGCNN(nn.Module):
         # K in front: the maximum over it is then an elementwise maximum of contiguous blocks.
         x, pooled = jnp.swapaxes(edges, 0, 1), []
         for channels in self.channels:
-            x = nn.Dense(channels, use_bias=False)(x)
+            x = gradient_written_out(nn.Dense(channels, use_bias=False)(x))
             x = jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask[None, :], train=train))
             pooled.append(leading_max(x))
         x = nn.Dense(self.width, use_bias=False)(jnp.concatenate(pooled, axis=-1))
+        x = gradient_written_out(x)
         return jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask, train=train))

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.numerics import row_min, safe_sqrt
+from jaxreg.cpu import row_min, written_out
+from jaxreg.numerics import safe_sqrt
 
 _FAR = 1e30
 
@@ -100,24 +101,7 @@ def _row_peak(x: Float[Array, "n m"]) -> Float[Array, "n"]:
 
 
 def _two_passes(one_pass, x: Float[Array, "n m"], source: Incidence, reference: Incidence):
-    return _materialized(one_pass(one_pass(x, source).T, reference).T)
-
-
-def _materialized(x: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """`x`, written out before anything reads it.
-
-    XLA would merge a transposition with what comes after it, and read at strides, number by number;
-    alone it is ten times as fast. Nothing crosses the border of a loop, so the rows are copied in one.
-    """
-    n = x.shape[0]
-    half = (n + 1) // 2
-
-    def copy(part, out):
-        start = jnp.minimum(part * half, n - half)
-        rows = jax.lax.dynamic_slice_in_dim(x, start, half)
-        return jax.lax.dynamic_update_slice_in_dim(out, rows, start, axis=0)
-
-    return jax.lax.fori_loop(0, 2, copy, jnp.zeros_like(x))
+    return written_out(one_pass(one_pass(x, source).T, reference).T)
 
 
 def _gather_both(x: Float[Array, "n m"], source: Incidence, reference: Incidence):

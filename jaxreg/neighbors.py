@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.numerics import row_min
+from jaxreg.cpu import row_min
 
 _BLOCK = 2048
 """Points whose distances to all others are held at once."""
