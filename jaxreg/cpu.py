@@ -5,7 +5,7 @@ Each was measured on jaxlib 0.10 (benchmarks/speed.py shows the stages); check a
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 
 def row_min(x: Shaped[Array, "n m"]) -> Shaped[Array, "n"]:
@@ -18,6 +18,17 @@ def row_min(x: Shaped[Array, "n m"]) -> Shaped[Array, "n"]:
         half = (x.shape[1] + 1) // 2
         x = jnp.minimum(x[:, :half], x[:, x.shape[1] - half :])
     return jnp.min(x, axis=1)
+
+
+def at_row_min(x: Float[Array, "n m"]) -> Bool[Array, "n m"]:
+    """Where the entries of a row equal its minimum, up to rounding; at least one in every row.
+
+    Without the allowance there might be none: XLA computes `x` anew for the comparison, in another
+    kernel, and the last bit may differ.
+    """
+    x = jax.lax.stop_gradient(x)
+    smallest = row_min(x)[:, None]
+    return x <= smallest + 8 * jnp.finfo(x.dtype).eps * jnp.abs(smallest)
 
 
 def written_out(x: Shaped[Array, "n *rest"]) -> Shaped[Array, "n *rest"]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.cpu import row_min, written_out
+from jaxreg.cpu import at_row_min, row_min, written_out
 from jaxreg.numerics import safe_sqrt
 
 _FAR = 1e30
@@ -94,8 +94,8 @@ def neighborhood_sum(
 
 
 def _row_peak(x: Float[Array, "n m"]) -> Float[Array, "n"]:
-    """``max_j x[i, j]``; entries that share the maximum share the derivative."""
-    highest = jax.lax.stop_gradient(x) >= -row_min(-jax.lax.stop_gradient(x))[:, None]
+    """``max_j x[i, j]``; entries that share the maximum, up to rounding, share the derivative."""
+    highest = at_row_min(-x)
     count = jnp.sum(highest, axis=1, dtype=x.dtype)
     return jnp.sum(jnp.where(highest, x, 0), axis=1) / count
 

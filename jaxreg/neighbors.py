@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.cpu import row_min
+from jaxreg.cpu import at_row_min, row_min
 
 _BLOCK = 2048
 """Points whose distances to all others are held at once."""
@@ -89,15 +89,17 @@ def nearest_in(
     others: Float[Array, "m 3"],
     mask: Bool[Array, "m"] | None = None,
 ) -> Int[Array, "n"]:
-    """Index into `others` of the nearest valid one of every point (the lowest index of equals)."""
+    """Index into `others` of the nearest valid one of every point.
+
+    Of those that are equally near, up to rounding, it is the first.
+    """
     distance = jax.lax.stop_gradient(squared_distances(points, without_padding(others, mask)))
     if mask is not None:
         distance = jnp.where(mask[None, :], distance, jnp.inf)
     # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
     # argmin, which carries both through one reduction, element by element.
     column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
-    smallest = row_min(distance)[:, None]
-    return row_min(jnp.where(distance <= smallest, column, others.shape[0] - 1))
+    return row_min(jnp.where(at_row_min(distance), column, others.shape[0] - 1))
 
 
 def _check_points(points: Array) -> None:

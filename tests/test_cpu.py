@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.cpu import gradient_written_out, row_min, written_out
+from jaxreg.cpu import at_row_min, gradient_written_out, row_min, written_out
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 16, 33, 50])
@@ -18,6 +18,12 @@ def test_minimum_of_rows_of_any_width(seed, width, dtype):
 def test_minimum_sees_infinity_and_nan():
     x = np.array([[np.inf, 2, np.inf], [np.inf] * 3, [1, np.nan, 0]])
     np.testing.assert_array_equal(jax.jit(row_min)(x), [2, np.inf, np.nan])
+
+
+def test_the_place_of_the_minimum_forgives_the_last_bit():
+    x = np.array([[3, 1, 1 + 2e-16, 1.001], [np.inf] * 4, [0, 1e-300, 0, 5], [-2, 2, -2, -1.999]])
+    expected = [[0, 1, 1, 0], [1, 1, 1, 1], [1, 0, 1, 0], [1, 0, 1, 0]]
+    np.testing.assert_array_equal(jax.jit(at_row_min)(x), expected)
 
 
 @pytest.mark.parametrize("shape", [(1, 4), (2, 1), (5, 3), (8, 2, 3)])
