@@ -1,4 +1,4 @@
-"""How the constants of `jaxreg/search/verdict.py` were fitted, and how well they judge.
+"""How the constants of `jaxreg/verdict.py` were fitted, and how well they judge.
 
     python benchmarks/calibrate_success.py [--data-root DATA] [--pairs 150]
 
@@ -18,11 +18,10 @@ import tyro
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from jaxreg import compilation
+from jaxreg import compilation, verdict
 from jaxreg.data import data_root, modelnet, shapes
 from jaxreg.metrics import rotation_angle_deg
 from jaxreg.register import register
-from jaxreg.search import verdict
 
 KINDS = ("full", "noisy", "crops", "unrelated", "apart")
 

@@ -32,6 +32,7 @@ from jaxreg.dense import register_dense
 from jaxreg.metrics import pair_errors
 from jaxreg.model import register_pair
 from jaxreg.pretrained import load_pretrained
+from jaxreg.register import register
 from jaxreg.types import Pair, RigidTransform
 
 SYMMETRIC = ("bottle", "bowl", "cone", "cup", "flower_pot", "lamp", "tent", "vase")
@@ -56,7 +57,7 @@ class Options:
     """What to run."""
 
     methods: tuple[str, ...] = ("dense",)
-    """`dense`, released weights (`weights:modelnet40`), or a baseline such as open3d_ransac_icp."""
+    """`dense`, `register`, released weights (`weights:modelnet40`), or a baseline such as open3d_ransac_icp."""
     protocols: tuple[str, ...] = PROTOCOLS
     """Files configs/modelnet40_NAME.toml."""
     curve: Literal["none", *CURVES] = "none"
@@ -114,6 +115,8 @@ def choose(name: str) -> Solve:
     """One pair to a transform; errors as `jaxreg.classical.choose` and `load_pretrained`."""
     if name == "dense":
         found = compilation.jit(lambda x, y: register_dense(x, y))
+    elif name == "register":
+        return lambda p: RigidTransform(*register(p.source.points, p.reference.points)[:2])
     elif name.startswith("weights:"):
         variables, config = load_pretrained(name.removeprefix("weights:"))
         found = compilation.jit(lambda x, y: register_pair(variables, x, y, config=config.model))

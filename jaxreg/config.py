@@ -206,30 +206,12 @@ class RefineConfig:
 class RegisterConfig:
     """Registration of two scans on the host (`jaxreg.register`)."""
 
-    search_points: int = 2048
+    search_points: int = 1024
     """Most points of a cloud in the search for a pose; larger clouds are averaged in voxels."""
-    feature_neighbors: int = 64
-    """Most neighbours of a point in its histograms."""
-    feature_radius: float = 5.0
-    """Radius of the histograms, in spacings of the points."""
-    correspondences: int = 1024
-    """Candidate correspondences."""
-    tolerance: float = 2.0
-    """Error of a right correspondence, in spacings."""
-    seeds: int = 64
-    """Poses made from the correspondences."""
-    partners: int = 24
-    """Correspondences that a pose is made from."""
-    starts: int = 576
-    """Rotations that cover SO(3), for shapes whose features say little."""
     limited_deg: float = 80.0
     """Largest rotation between two clouds that `rotation = "limited"` looks for."""
-    verified: int = 12
-    """Poses that are polished and compared before the best is refined."""
     reach: float = 1.5
     """A point agrees with the other cloud when it is within this many spacings of it."""
-    convincing: float = 0.9
-    """Probability of the best pose from features below which the dense path adds its poses."""
     refine_points: int = 4096
     """Most points of a cloud in the refinement."""
     refine_iterations: int = 15

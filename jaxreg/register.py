@@ -1,27 +1,32 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
+import functools
 import time
 from typing import Literal, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from jaxreg import scans
+from jaxreg import compilation, scans, verdict
 from jaxreg.config import RegisterConfig
+from jaxreg.dense.register import search_dense
 from jaxreg.refine.host import Refined
 from jaxreg.refine.host import refine as refine_pose
+from jaxreg.refine.tree import index_cloud
 from jaxreg.refine.uncertainty import weak_directions
-from jaxreg.search import host, verdict
 from jaxreg.types import RigidTransform
 
 Rotation = Literal["limited", "full"]
 Refinement = Literal["gicp", "icp", "point_to_plane"]
 
 _DEFAULT = RegisterConfig()
-_FEWEST_FOR_FEATURES = 32
-_FEWEST_FOR_NORMALS = 11
+_NORMAL_NEIGHBORS = 10
+_SMALLEST = 512
+"""Smallest size of a padded cloud in the search."""
+_PREFERENCE = 0.01
+"""What half a turn costs in the choice of a pose: of those that agree equally (a symmetric shape)
+the one that turns least is taken."""
 
 
 class ScanRegistration(NamedTuple):
@@ -89,17 +94,21 @@ def register(
     frame = scans.common_frame(moving.points, fixed.points)
     x = (moving.points - frame.source_centre) / frame.length
     y = (fixed.points - frame.reference_centre) / frame.length
-    clouds = *host.coarse_pair(x, y, config), frame
-    rival = verdict.NO_RIVAL
+    a, b, spacing = scans.at_one_density(x, y, config.search_points)
     if start is None:
-        pose, rival = _searched(*clouds, rotation, config)
+        pose, rival = _searched(a, b, frame, rotation, config)
     else:
-        start = _stacked(scans.pose_in(frame, start))
-        pose = _first(host.polished(start, *clouds[:3])) if refine else _first(start)
-    refined = _refined(x, y, pose, refine, clouds[2], config)
-    reach = config.reach * clouds[2]
-    judged = verdict.evidence(refined.transform, *clouds[:2], reach, rival=rival)
+        pose, rival = scans.pose_in(frame, start), verdict.NO_RIVAL
+    refined = _refined(x, y, pose, refine, spacing, config)
+    clouds = (index_cloud(_enough(p), neighbors=_NORMAL_NEIGHBORS) for p in (a, b))
+    reach = config.reach * spacing
+    judged = verdict.evidence(refined.transform, *clouds, reach, rival=rival)
     return _result(x, y, moving, fixed, frame, refined, judged, reach, begin)
+
+
+def _enough(points: np.ndarray) -> np.ndarray:
+    """The points, all of them as often as normals need it."""
+    return np.tile(points, (-(-(_NORMAL_NEIGHBORS + 1) // len(points)), 1))
 
 
 def _check_options(rotation: str, refine: str | None) -> None:
@@ -128,72 +137,56 @@ def _check_initial(initial: object) -> RigidTransform:
 
 
 def _searched(
-    source: host.Coarse,
-    reference: host.Coarse,
-    spacing: float,
-    frame: scans.Frame,
-    rotation: Rotation,
-    config: RegisterConfig,
+    x: np.ndarray, y: np.ndarray, frame: scans.Frame, rotation: Rotation, config: RegisterConfig
 ) -> tuple[RigidTransform, float]:
-    """The pose on which the coarse clouds agree best, and how much worse the next best agrees.
-
-    Poses come from matched histograms. Where the best of them leaves a doubt, the dense path adds
-    its own; clouds of few points have no histograms, and are turned by a covering of the rotations.
-    """
-    largest = 180.0 if rotation == "full" else config.limited_deg
+    """The most plausible pose, and how much more plausible it is than the next that differs."""
+    size = scans.bucket(max(len(x), len(y)), smallest=_SMALLEST, largest=config.search_points)
     unmoved = scans.pose_in(frame, RigidTransform(np.eye(3), np.zeros(3)))
-    pool = RigidTransform(np.stack([np.eye(3)] * 2), np.stack([np.zeros(3), unmoved.translation]))
-    if min(len(source.valid), len(reference.valid)) < _FEWEST_FOR_FEATURES:
-        pool = host.joined(pool, host.start_poses(source, reference, config, largest_deg=largest))
-        return _best(pool, source, reference, spacing, largest, config)
-    pool = host.joined(pool, host.feature_poses(source, reference, spacing, config))
-    pose, lead = _best(pool, source, reference, spacing, largest, config)
-    found = verdict.evidence(pose, source, reference, config.reach * spacing, rival=lead)
-    if verdict.probability(found) > config.convincing:
-        return pose, lead
-    more = host.joined(_stacked(pose), host.dense_poses(source, reference))
-    return _best(more, source, reference, spacing, largest, config)
+    largest = 180.0 if rotation == "full" else config.limited_deg
+    poses, score = _search()(
+        *scans.padded(x, size),
+        *scans.padded(y, size),
+        RigidTransform(*(part.astype(np.float32) for part in unmoved)),
+        np.float32(np.radians(largest)),
+    )
+    poses, score = RigidTransform(*(np.asarray(p, np.float64) for p in poses)), np.asarray(score)
+    best = int(np.argmax(score - _PREFERENCE * _angles(poses, np.eye(3)) / np.pi))
+    apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
+    others = (_angles(poses, poses.rotation[best]) > np.radians(15)) | (apart > 0.2)
+    lead = score[best] - score[others].max() if others.any() else verdict.NO_RIVAL
+    return RigidTransform(poses.rotation[best], poses.translation[best]), float(lead)
 
 
-def _best(pool, source, reference, spacing, largest_deg, config) -> tuple[RigidTransform, float]:
-    """The pose of a pool that agrees best after polishing, the lead over others, its disagreement."""
-    pool = host.turned_less(pool, largest_deg)
-    scores = host.disagreement(pool, source, reference, 3 * spacing)
-    chosen = host.distinct_best(pool, scores, config.verified, apart=2 * spacing)
-    chosen = host.polished(chosen, source, reference, spacing)
-    # A narrow reach: flips of nearly symmetric shapes agree roughly, and only the truth closely.
-    scores = host.disagreement(chosen, source, reference, spacing)
-    # Of poses that agree equally (a symmetric shape) the one that turns least.
-    best = int(np.argmin(scores + 0.01 * host.angles(chosen) / np.pi))
-    others = host.differs(chosen, best)
-    lead = scores[others].min() - scores[best] if others.any() else verdict.NO_RIVAL
-    return jax.tree.map(lambda part: part[best], chosen), float(lead)
+@functools.cache
+def _search():
+    def run(x, x_mask, y, y_mask, also, largest_angle):
+        return search_dense(
+            x, y, source_mask=x_mask, reference_mask=y_mask, also=also, largest_angle=largest_angle
+        )
+
+    return compilation.jit(run)
 
 
-def _stacked(pose: RigidTransform) -> RigidTransform:
-    return RigidTransform(*(part[None] for part in pose))
-
-
-def _first(poses: RigidTransform) -> RigidTransform:
-    return jax.tree.map(lambda part: part[0], poses)
+def _angles(poses: RigidTransform, rotation: np.ndarray) -> Float[np.ndarray, "p"]:
+    """By how much every pose turns from `rotation`, in [0, pi]."""
+    chord = np.linalg.norm(poses.rotation - rotation, axis=(1, 2)) / np.sqrt(8)
+    return 2 * np.arcsin(np.minimum(chord, 1))
 
 
 def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> Refined:
     """The pose refined with more points than the search had."""
-    x, y = (scans.reduce_to(points, config.refine_points) for points in (x, y))
+    x, y = (_enough(scans.reduce_to(points, config.refine_points)) for points in (x, y))
     finer = min(spacing, max(scans.spacing(x), scans.spacing(y)))
-    few = min(len(x), len(y)) < _FEWEST_FOR_NORMALS
-    if few:
-        x, y = (np.resize(points, (_FEWEST_FOR_NORMALS, 3)) for points in (x, y))
     return refine_pose(
         x,
         y,
-        method="icp" if few else method or "icp",
+        method=method or "icp",
         initial=pose,
         iterations=config.refine_iterations if method else 1,
         max_distance=3 * finer if method else 0.0,
         anneal=4.0,
         both_directions=True,
+        neighbors=_NORMAL_NEIGHBORS,
         dense_limit=0,
     )
 

@@ -197,6 +197,23 @@ def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, 
     return reduced
 
 
+def at_one_density(
+    source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], most: int
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "w 3"], float]:
+    """Both clouds with at most `most` points and alike spacing, and the larger spacing of the two.
+
+    What is counted around a point depends on the density, and clouds are compared by such counts.
+    """
+    clouds = [reduce_to(points, most) for points in (source, reference)]
+    spacings = [spacing(points) for points in clouds]
+    size = max(spacings)
+    for k in (0, 1):
+        if 1.3 * spacings[k] < size:
+            clouds[k] = voxel_reduced(clouds[k], size)
+            spacings[k] = spacing(clouds[k])
+    return *clouds, max(spacings)
+
+
 def padded(
     points: Float[np.ndarray, "n 3"], size: int
 ) -> tuple[Float[np.ndarray, "size 3"], Bool[np.ndarray, "size"]]:

@@ -6,8 +6,6 @@ import pytest
 from jaxreg import scans
 from jaxreg.types import RigidTransform
 
-pytestmark = [pytest.mark.slow]
-
 
 @pytest.fixture
 def rng(seed):

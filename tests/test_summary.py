@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg import summary
 from jaxreg.register import ScanRegistration
-from jaxreg.search.verdict import Evidence
+from jaxreg.verdict import Evidence
 
 
 @pytest.fixture

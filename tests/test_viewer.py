@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg import viewer
 from jaxreg.register import ScanRegistration
-from jaxreg.search.verdict import Evidence
+from jaxreg.verdict import Evidence
 
 POSE = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
 

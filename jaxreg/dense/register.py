@@ -1,5 +1,6 @@
 """The dense path from two clouds to a pose; jit, vmap and grad it."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -62,11 +63,18 @@ def search_dense(
     *,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
+    also: RigidTransform | None = None,
+    largest_angle: Float[Array, ""] | float = math.pi,
     config: DenseConfig = _DEFAULT,
 ) -> Search:
-    """The finalists of the search before the last refinement; errors as `register_dense`."""
+    """The finalists of the search before the last refinement; errors as `register_dense`.
+
+    `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
+    (radians) are not.
+    """
     where, x, y = _enter(source, reference, source_mask, reference_mask, config)
-    found = _search(x, y, source_mask, reference_mask, config)
+    also = None if also is None else frame.transform_in(where, also)
+    found = _search(x, y, source_mask, reference_mask, config, also, largest_angle)
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
 
 
@@ -88,7 +96,9 @@ def _surface(points: Array, mask: Array | None, config: DenseConfig):
     return Surface(points, described.normals, rim, valid), described.features
 
 
-def _search(x, y, source_mask, reference_mask, config: DenseConfig) -> Search:
+def _search(
+    x, y, source_mask, reference_mask, config: DenseConfig, also=None, largest_angle=math.pi
+) -> Search:
     x, y = jax.lax.stop_gradient((x, y))
     source, features = _surface(x, source_mask, config)
     reference, others = _surface(y, reference_mask, config)
@@ -98,7 +108,7 @@ def _search(x, y, source_mask, reference_mask, config: DenseConfig) -> Search:
         nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
         for s in (reference, source)
     ]
-    poses = _screened(poses, source, reference, grids, config)
+    poses = _screened(poses, also, source, reference, grids, largest_angle, config)
     coarse = lambda pose: align_coarse(  # noqa: E731
         pose,
         thinned(source, config.coarse_step),
@@ -108,12 +118,12 @@ def _search(x, y, source_mask, reference_mask, config: DenseConfig) -> Search:
         thickness=config.coarse_thickness,
     )
     poses = jax.vmap(coarse)(poses)
-    poses, _ = _ranked(poses, source, reference, config, config.finalists)
+    poses = _ranked(poses, source, reference, largest_angle, config).poses
     fine = lambda pose: align_fine(  # noqa: E731
         pose, source, reference, config.fine_widths, thickness=config.thickness
     )
     poses = jax.lax.map(fine, poses)
-    return Search(*_ranked(poses, source, reference, config, config.finalists))
+    return _ranked(poses, source, reference, largest_angle, config)
 
 
 def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: DenseConfig):
@@ -140,13 +150,24 @@ def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: 
 
 
 def _screened(
-    poses, source: Surface, reference: Surface, grids: list[NearestGrid], config: DenseConfig
+    poses,
+    also,
+    source: Surface,
+    reference: Surface,
+    grids: list[NearestGrid],
+    largest_angle,
+    config: DenseConfig,
 ):
-    """The distinct best hypotheses by their overlap in both directions."""
+    """The distinct best hypotheses by their overlap in both directions, `also` the first of them."""
+    if also is not None:
+        poses = jax.tree.map(lambda one, all: jnp.concatenate([one[None], all]), also, poses)
     a, b = thinned(source, config.coarse_step), thinned(reference, config.coarse_step)
     backward = jax.vmap(rigid.inverse)(poses)
     score = screen(poses, a, reference, grids[0], width=config.screen_width)
     score = score + screen(backward, b, source, grids[1], width=config.screen_width)
+    score = jnp.where(_turns_less(poses, largest_angle), score, -5)
+    if also is not None:
+        score = score.at[0].set(5)
     chosen = pick_distinct(
         poses,
         score,
@@ -157,8 +178,15 @@ def _screened(
     return best_of(poses, chosen)
 
 
-def _ranked(poses, source: Surface, reference: Surface, config: DenseConfig, count: int):
-    """The `count` most plausible poses, best first, and their plausibility."""
+def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:
+    trace = jnp.trace(poses.rotation, axis1=1, axis2=2)
+    return trace >= 1 + 2 * jnp.cos(angle) - 1e-5
+
+
+def _ranked(
+    poses, source: Surface, reference: Surface, largest_angle, config: DenseConfig
+) -> Search:
+    """The most plausible poses, best first, and their plausibility."""
     found = jax.lax.map(
         lambda pose: evidence(
             pose,
@@ -171,8 +199,10 @@ def _ranked(poses, source: Surface, reference: Surface, config: DenseConfig, cou
         poses,
     )
     score = plausibility(found, contradiction=config.contradiction, beside=config.beside)
-    score, order = jax.lax.top_k(score, min(count, len(score)))
-    return best_of(poses, order), score
+    # Alignment may have turned a pose out of the bounds of the search.
+    score = jnp.where(_turns_less(poses, largest_angle), score, score - 10)
+    score, order = jax.lax.top_k(score, min(config.finalists, len(score)))
+    return Search(best_of(poses, order), score)
 
 
 def _registration(where, pose, a: Surface, b: Surface, config: DenseConfig) -> Registration:

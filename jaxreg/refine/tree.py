@@ -24,6 +24,8 @@ Method = Literal["icp", "point_to_plane", "gicp"]
 
 _COARSE = 30_000
 """Points of a cloud that find the pose before all of them polish it."""
+_SMALLEST = 256
+"""Smallest padded size: below, one compilation more costs more than the padding."""
 
 
 class IndexedCloud(NamedTuple):
@@ -44,7 +46,7 @@ def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
     rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
     rows[: len(points)] = index
     padded = jnp.asarray(np.pad(points, ((0, size - len(points)), (0, 0))))
-    return IndexedCloud(points, tree, padded, jax.jit(normals)(padded, jnp.asarray(rows)))
+    return IndexedCloud(points, tree, padded, _normals(padded, jnp.asarray(rows)))
 
 
 def iterate(
@@ -113,9 +115,12 @@ def tree_pairs(
 
 
 def padded_size(count: int) -> int:
-    """The next of 4, 5, 6, 7, 8, 10, 12, 14, 16, 20 ...: at most a quarter of padding."""
+    """The next of 256, 320, 384, 448, 512, 640 ...: at most a quarter of padding above 256."""
     unit = 1 << max((count - 1).bit_length() - 3, 0)
-    return max(-(-count // unit) * unit, 4)
+    return max(-(-count // unit) * unit, _SMALLEST)
+
+
+_normals = jax.jit(normals)
 
 
 @partial(jax.jit, static_argnames=("kernel", "trim", "method", "thickness"))

@@ -1,7 +1,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
@@ -9,8 +8,6 @@ from jaxreg.dense.alignment import align_coarse, align_fine
 from jaxreg.dense.nearest import nearest_grid
 from jaxreg.dense.surface import Surface
 from jaxreg.types import RigidTransform
-
-pytestmark = [pytest.mark.slow]
 
 WIDTHS = (0.3, 0.2, 0.15, 0.1, 0.1, 0.1)
 
@@ -66,7 +63,6 @@ def test_padding_changes_nothing_and_no_pair_keeps_the_pose(seed):
     np.testing.assert_allclose(kept.rotation, start.rotation, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_derivative_of_the_fine_alignment(seed):
     source, reference, _, start = pair(seed, n=40, m=50)
 

@@ -7,11 +7,24 @@ from scipy.spatial.transform import Rotation
 from jaxreg.config import DenseConfig
 from jaxreg.dense import register_dense
 
-pytestmark = [pytest.mark.float32, pytest.mark.slow]
+pytestmark = [pytest.mark.float32]
 CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=12, finalists=3)
-solve = jax.jit(
-    lambda x, y, a, b: register_dense(x, y, source_mask=a, reference_mask=b, config=CONFIG)
-)  # noqa: E731,E501
+
+
+@jax.jit
+def solve_and_grad(x, y, a, b):
+    """The registration and the gradient of its rotation's first row: all tests share one program."""
+
+    def total(x):
+        found = register_dense(x, y, source_mask=a, reference_mask=b, config=CONFIG)
+        return jnp.sum(found.rotation[0]), found
+
+    gradient, found = jax.grad(total, has_aux=True)(x)
+    return found, gradient
+
+
+def solve(*clouds):
+    return solve_and_grad(*clouds)[0]
 
 
 def shape(rng, n):
@@ -68,13 +81,11 @@ def test_no_valid_point_gives_the_identity(seed):
     assert np.isfinite(found.correspondences).all()
 
 
-@pytest.mark.slow
 def test_derivatives_are_finite_and_do_not_see_padding(seed):
     source, reference, _ = make_pair(seed)
     x, mask = padded(source, 400, np.nan)
     y, other = padded(reference, 400, np.nan)
-    total = lambda x: jnp.sum(solve(x, y, mask, other).rotation[0])  # noqa: E731
-    gradient = np.asarray(jax.grad(total)(x))
+    gradient = np.asarray(solve_and_grad(x, y, mask, other)[1])
     assert np.isfinite(gradient).all()
     assert np.any(gradient[:380] != 0)
     assert np.all(gradient[380:] == 0)

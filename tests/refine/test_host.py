@@ -11,8 +11,6 @@ from jaxreg.refine.host import refine
 from jaxreg.refine.uncertainty import pose_uncertainty
 from jaxreg.types import RigidTransform
 
-pytestmark = [pytest.mark.slow]
-
 METHODS = ["icp", "point_to_plane", "gicp"]
 
 

@@ -3,20 +3,23 @@
 import numpy as np
 import pytest
 
-from jaxreg.config import RegisterConfig
+from jaxreg import scans, verdict
 from jaxreg.data import shapes
-from jaxreg.search import host, verdict
+from jaxreg.refine.tree import index_cloud
 from jaxreg.types import RigidTransform
 
-pytestmark = [pytest.mark.slow]
-
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
+
+
+def indexed(source, reference):
+    x, y, spacing = scans.at_one_density(source, reference, 512)
+    return index_cloud(x, neighbors=10), index_cloud(y, neighbors=10), spacing
 
 
 @pytest.fixture(scope="module")
 def clouds():
     cloud = shapes.sample_shape(5, 9, points=1000).astype(np.float64)
-    return host.coarse_pair(cloud[:500], cloud[500:], RegisterConfig())
+    return indexed(cloud[:500], cloud[500:])
 
 
 def test_right_pose_is_trusted_and_a_wrong_one_is_not(clouds):
@@ -50,7 +53,7 @@ def test_constraint_is_small_for_a_plane_and_large_for_a_corner(seed):
     corner = np.concatenate([np.roll(plane[i::3], i, axis=1) for i in range(3)])
     found = []
     for cloud in (plane, corner):
-        a, b, spacing = host.coarse_pair(cloud, cloud, RegisterConfig())
+        a, b, spacing = indexed(cloud, cloud)
         found.append(verdict.evidence(IDENTITY, a, b, spacing, rival=0.2).constraint)
     assert found[0] < 1e-6
     assert found[1] > 0.01

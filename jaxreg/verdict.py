@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.search.host import Coarse
+from jaxreg import scans
+from jaxreg.refine.tree import IndexedCloud
 from jaxreg.types import RigidTransform
 
 TRUSTED = 0.5
@@ -34,15 +35,20 @@ class Evidence(NamedTuple):
 
 
 def evidence(
-    pose: RigidTransform, source: Coarse, reference: Coarse, reach: float, *, rival: float
+    pose: RigidTransform,
+    source: IndexedCloud,
+    reference: IndexedCloud,
+    reach: float,
+    *,
+    rival: float,
 ) -> Evidence:
-    """The evidence for one pose, from every point of both coarse clouds."""
+    """The evidence for one pose, from every point of both clouds, which have one density."""
     rotation, translation = pose
-    x, y = source.valid, reference.valid
-    x_normals, y_normals = source.normals[: len(x)] @ rotation.T, reference.normals[: len(y)]
+    x, y = source.points, reference.points
+    x_normals, y_normals = _normals(source) @ rotation.T, _normals(reference)
     moved, back = x @ rotation.T + translation, (y - translation) @ rotation
-    distance, index = reference.tree.query(moved, workers=-1)
-    other_distance, other_index = source.tree.query(back, workers=-1)
+    distance, index = scans.nearest(reference.tree, moved)
+    other_distance, other_index = scans.nearest(source.tree, back)
     near, other_near = distance < reach, other_distance < reach
     shares = near.mean(), other_near.mean()
     there = _beside(moved[near], y[index[near]], x_normals[near], y_normals[index[near]])
@@ -64,18 +70,21 @@ def evidence(
     )
 
 
+def _normals(cloud: IndexedCloud) -> Float[np.ndarray, "n 3"]:
+    return np.asarray(cloud.normals, np.float64)[: len(cloud.points)]
+
+
 def _beside(x: np.ndarray, y: np.ndarray, x_normals: np.ndarray, y_normals: np.ndarray):
     """Distances of points from their partners' planes, and cosines of the normals."""
     across = np.abs(np.sum((x - y) * y_normals, axis=1))
     return across, np.abs(np.sum(x_normals * y_normals, axis=1))
 
 
-def _own(cloud: Coarse):
+def _own(cloud: IndexedCloud):
     """The same between every point and its nearest neighbour in its own cloud."""
-    count = len(cloud.valid)
-    index = cloud.neighbors[:count, 0]
-    normals = cloud.normals[:count]
-    return _beside(cloud.valid, cloud.valid[index], normals, normals[index])
+    index = cloud.tree.query(cloud.points, k=2, workers=-1)[1][:, 1]
+    normals = _normals(cloud)
+    return _beside(cloud.points, cloud.points[index], normals, normals[index])
 
 
 def _median(values: np.ndarray, default: float) -> float:
@@ -95,7 +104,12 @@ def _constraint(points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 
 
 
 def probability(found: Evidence) -> float:
-    """The chance that the pose is right (a logistic regression; the constants' origin is below)."""
+    """The chance that the pose is right: a logistic regression, whose constants' origin is below.
+
+    0 where the clouds leave a motion free, as planes do: no pose is the right one then.
+    """
+    if found.constraint < _LEAST_CONSTRAINT:
+        return 0.0
     inputs = features(found)
     return float(1 / (1 + np.exp(-np.clip(_INTERCEPT + inputs @ _COEFFICIENTS, -50, 50))))
 
@@ -114,6 +128,7 @@ def features(found: Evidence) -> Float[np.ndarray, "6"]:
     )
 
 
+_LEAST_CONSTRAINT = 1e-5
 _INTERCEPT = 7.82
 _COEFFICIENTS = np.array([2.07, 1.5, -3.9, 7.33, 2.57, 4.07])
 """To be fitted by benchmarks/calibrate_success.py."""

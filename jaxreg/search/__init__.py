@@ -1,1 +1,0 @@
-"""Where one cloud lies on another, without a guess: matches of features, and a covering of SO(3)."""
