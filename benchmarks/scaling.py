@@ -61,7 +61,7 @@ def line(found: dict) -> str:
 
 
 def exponent(points: list[int], values: list[float]) -> float:
-    """b of ``value = a points^b`` by least squares on the logarithms."""
+    """The exponent b of ``value = a points^b`` by least squares on the logarithms."""
     return float(np.polyfit(np.log(points), np.log(values), 1)[0])
 
 
