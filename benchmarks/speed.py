@@ -30,6 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import candidates, processes, stages
+from jaxreg.compilation import restart_with_huge_pages
 
 Part = Literal["forward", "training", "stages", "programs", "first"]
 CONSOLE = Console(width=110)
@@ -52,6 +53,8 @@ class Options:
     """A candidate that has used up this time is not run again."""
     cores: int = 0
     """Run on so many cores; 0 is all."""
+    huge_pages: bool = False
+    """Run in memory pages of 2 MB, as train.py does on Linux."""
     json: str = ""
     """Write the figures to this file."""
 
@@ -203,6 +206,8 @@ def machine() -> dict:
 def main() -> None:
     """Measure the parts that are asked for, and print their tables."""
     options = tyro.cli(Options, description=__doc__)
+    if options.huge_pages:
+        restart_with_huge_pages()
     if options.cores:
         confine(options.cores)
     results = {"options": dataclasses.asdict(options), "machine": machine()}
