@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
@@ -15,6 +16,8 @@ from jaxreg.cpu import at_row_min, row_min, written_out
 from jaxreg.numerics import safe_sqrt
 
 _FAR = 1e30
+KEPT = ("squared feature distance", "dual")
+"""Names of the maps that a gradient keeps; the others it computes again (see `model.iterate`)."""
 
 
 def squared_feature_distance(
@@ -185,6 +188,7 @@ def matching_maps(
         else:
             dual = neighborhood_sum(scores, *graphs) / k
             dual = dual + neighborhood_sum(nearest, *nearest_graphs) / k
+    dual = checkpoint_name(dual, KEPT[1])
     return Maps(scores, dual, matching_scores(final_distance(total, dual, alpha=alpha), valid))
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg import matching_blocks, rigid
@@ -17,6 +18,7 @@ from jaxreg.features import DGCNN, relative_neighbors
 from jaxreg.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.invariants import geometric_structure
 from jaxreg.matching import (
+    KEPT,
     Incidence,
     Matches,
     feature_distance,
@@ -154,6 +156,7 @@ def _match(source_features, reference_features, source_graph, reference_graph, r
         branches = _branches(features, graphs, config)
         return match_in_blocks(branches, reference.points, alpha=config.alpha, valid=reference.mask)
     squared = squared_feature_distance(source_features[0], reference_features[0])
+    squared = checkpoint_name(squared, KEPT[0])
     distance = safe_sqrt(squared)
     nearest_distance, nearest_graphs = None, None
     if config.one_nn == "own":
@@ -245,9 +248,10 @@ def iterate(
         return (rigid.compose(motion, total), variables), seen
 
     start = (rigid.identity(source.points.dtype), variables)
-    # A step is computed again in the backward pass: cheaper than writing out and reading back a
-    # dozen (n, m) arrays a step, and less than half of the memory.
-    step = jax.checkpoint(step, prevent_cse=False)
+    # A step is computed again in the backward pass, but for the two maps that cost most: cheaper than
+    # writing out and reading back a dozen (n, m) arrays a step, and less than half of the memory.
+    kept = jax.checkpoint_policies.save_only_these_names(*KEPT)
+    step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables
 
