@@ -31,15 +31,21 @@ def peak_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def run(task: str, cache: str | None = None, **options) -> dict:
-    """The findings of a fresh process; `cache` is where the compilation cache begins.
+def run(task: str, *, cache: str = "", huge_pages: bool = False, **options) -> dict:
+    """The findings of a fresh process.
+
+    `cache` is the folder that it takes for the user's caches; `huge_pages` gives it the memory pages
+    that train.py asks for.
 
     Raises:
       RuntimeError: the process failed; the message ends with what it wrote.
     """
-    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    left_out = "JAX_COMPILATION_CACHE_DIR", "GLIBC_TUNABLES"
+    environment = {k: v for k, v in os.environ.items() if k not in left_out}
     if cache:
         environment["XDG_CACHE_HOME"] = cache
+    if huge_pages:
+        environment["GLIBC_TUNABLES"] = "glibc.malloc.hugetlb=1"
     begin = time.perf_counter()
     process = subprocess.run(
         [sys.executable, "-m", "benchmarks.processes", task],
@@ -56,10 +62,17 @@ def run(task: str, cache: str | None = None, **options) -> dict:
     return json.loads(process.stdout.splitlines()[-1]) | {"process_s": seconds}
 
 
-def first_results(task: str, points: int) -> tuple[dict, dict]:
+def first_results(task: str, **options) -> tuple[dict, dict]:
     """Findings of a process that finds an empty compilation cache, and of the next one."""
     with TemporaryDirectory() as cache:
-        return run(task, cache, points=points), run(task, cache, points=points)
+        return run(task, cache=cache, **options), run(task, cache=cache, **options)
+
+
+def train(points: int, batch: int, rounds: int, seconds: float) -> dict:
+    """The candidates of the training step, in turns."""
+    from benchmarks import candidates
+
+    return {"rows": candidates.train(points, batch=batch, rounds=rounds, seconds=seconds)}
 
 
 def register_pair(points: int) -> dict:
@@ -102,17 +115,23 @@ def measure(
     implementation: str = "jaxreg",
     rounds: int = 1,
     limit_mb: float = 0,
+    cached: bool = False,
 ) -> dict:
-    """Seconds to trace and to compile, seconds and peak memory of running; without any cache.
+    """Seconds to trace and to compile, seconds and peak memory of running.
 
+    Nothing is taken from a compilation cache unless `cached`, where the command line tools' is used.
     `program` is `forward`, `gradient` or `step`. Where the compiled program says that it needs more
     than `limit_mb` it is not run, and `needs_mb` says how much.
     """
     import jax
 
     from benchmarks import timing
+    from jaxreg import compilation
 
-    jax.config.update("jax_enable_compilation_cache", False)
+    if cached:
+        compilation.enable_compilation_cache()
+    else:
+        jax.config.update("jax_enable_compilation_cache", False)
     function, inputs = _program(program, points, batch, implementation)
     before, begin = peak_mb(), time.perf_counter()
     lowered = function.lower(*inputs)
@@ -168,5 +187,6 @@ def _program(program: str, points: int, batch: int, implementation: str) -> tupl
 
 
 if __name__ == "__main__":
-    task = {"measure": measure, "register_pair": register_pair, "register": register}[sys.argv[1]]
+    tasks = (measure, train, register_pair, register)
+    task = {task.__name__: task for task in tasks}[sys.argv[1]]
     print(json.dumps(task(**json.load(sys.stdin))))

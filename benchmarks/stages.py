@@ -6,7 +6,7 @@ a root or an arctangent counts as one operation:
     graphs               8 n^2                      squared distances, for each cloud
     features             2 n K sum(c_l c_l+1) + 2 n (sum c_l) C          one cloud
     feature distance     2 n m C + 4 n m
-    1-NN distance        0                          rows and columns of the distance
+    1-NN distance        n m                        rows and columns, then the root
     maps M, M-hat, G     8 n m + n m + (2 K - 2) n m + n m        two softmaxes, sum, division by K
     final map, copy      4 n m + 4 n m + 6 n m + 2 n m     D', softmax, copy, peaks
     inliers              2 n [30 K (K - 1) / 2 + 2 K (d w + 2 w^2)] + 16 n K w^2 + 8 n K w
@@ -28,6 +28,7 @@ from jaxreg.compilation import jit
 from jaxreg.config import ModelConfig
 from jaxreg.inliers import InlierNetwork, select_inliers
 from jaxreg.invariants import geometric_structure
+from jaxreg.numerics import safe_sqrt
 from jaxreg.procrustes import weighted_procrustes
 from jaxreg.types import PointCloud
 
@@ -49,7 +50,7 @@ def operations(n: int, m: int, config: ModelConfig) -> dict[str, float]:
         "graphs": 8 * n * n,
         "features": 2 * n * k * lift + 2 * n * sum(config.channels) * c,
         "feature distance": 2 * n * m * c + 4 * n * m,
-        "1-NN distance": 0,
+        "1-NN distance": n * m,
         "maps M, M-hat, G": (10 + 2 * (config.k_matching - 1)) * n * m,
         "final map, copy": 16 * n * m,
         "inliers": 2 * n * (30 * angles + 2 * k * (structure * w + 2 * w * w))
@@ -69,14 +70,12 @@ def stages(points: int, batch: int) -> dict[str, Stage]:
     of_points = jit(
         jax.vmap(lambda x, g: model.point_features(variables, x, g, mask, config=config)[0])
     )
-    distances = jit(jax.vmap(matching.feature_distance))
-    of_nearest = jit(jax.vmap(lambda d, p, q: matching.neighborhood_sum(d, p.nearest, q.nearest)))
-    to_maps, to_copy = _matching_programs(config)
+    distances, of_nearest, to_maps, to_copy = map(jit, map(jax.vmap, _matching_programs(config)))
     trust, solve = _inlier_programs(variables, config)
     graphs = of_cloud(sources), of_cloud(references)
     features = [of_points(x, g) for x, g in zip((sources, references), graphs, strict=True)]
-    distance = distances(*features)
-    nearest = of_nearest(distance, *graphs)
+    squared, distance = distances(*features)
+    nearest = of_nearest(squared, *graphs)
     dual = to_maps(distance, nearest, *graphs)
     copy = to_copy(distance, nearest, dual, references)[0]
     confidence = trust(sources, copy, graphs[0].neighbors)
@@ -84,7 +83,7 @@ def stages(points: int, batch: int) -> dict[str, Stage]:
         "graphs": (of_cloud, sources),
         "features": (of_points, sources, graphs[0]),
         "feature distance": (distances, *features),
-        "1-NN distance": (of_nearest, distance, *graphs),
+        "1-NN distance": (of_nearest, squared, *graphs),
         "maps M, M-hat, G": (to_maps, distance, nearest, *graphs),
         "final map, copy": (to_copy, distance, nearest, dual, references),
         "inliers": (trust, sources, copy, graphs[0].neighbors),
@@ -98,17 +97,25 @@ def stages(points: int, batch: int) -> dict[str, Stage]:
     }
 
 
-def _matching_programs(config: ModelConfig) -> tuple[Callable, Callable]:
+def _matching_programs(config: ModelConfig) -> tuple[Callable, ...]:
+    """What `jaxreg.model` does between the features and the copy, in four parts."""
+
+    def distances(source, reference):
+        squared = matching.squared_feature_distance(source, reference)
+        return squared, safe_sqrt(squared)
+
+    def of_nearest(squared, p, q):
+        return safe_sqrt(matching.neighborhood_sum(squared, p.nearest, q.nearest))
+
     def to_maps(distance, nearest, p, q):
         scores = matching.matching_scores(distance) + matching.matching_scores(nearest)
         return matching.neighborhood_sum(scores, p.matching, q.matching) / config.k_matching
 
     def to_copy(distance, nearest, dual, reference):
         final = matching.final_distance(distance + nearest, dual, alpha=config.alpha)
-        maps = matching.Maps(distance, dual, matching.matching_scores(final))
-        return matching.match(maps, reference)
+        return matching.match(dual, matching.matching_scores(final), reference)
 
-    return jit(jax.vmap(to_maps)), jit(jax.vmap(to_copy))
+    return distances, of_nearest, to_maps, to_copy
 
 
 def _inlier_programs(variables, config: ModelConfig) -> tuple[Callable, Callable]:

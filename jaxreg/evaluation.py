@@ -95,7 +95,7 @@ def given_pair_batches(
 
 def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:
     """The true transforms of the pairs (numpy, stacked)."""
-    parts = [jax.tree.map(lambda x, c=n: np.asarray(x)[:c], pair.transform) for pair, n in batches]
+    parts = [jax.tree.map(lambda x, c=n: np.array(x)[:c], pair.transform) for pair, n in batches]
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
@@ -116,9 +116,8 @@ def evaluate_method(
         predicted = jax.block_until_ready(method(pair))
         seconds += time.perf_counter() - begin
         done += pair.source.mask.shape[0]
-        results.append(
-            jax.tree.map(lambda x, c=count: np.asarray(x)[:c], (predicted, pair.transform))
-        )
+        # Copies: a numpy view would keep the array that it looks at alive on the device.
+        results.append(jax.tree.map(lambda x, c=count: np.array(x)[:c], (predicted, pair.transform)))
         progress(count)
     predicted, truth = jax.tree.map(lambda *parts: np.concatenate(parts), *results)
     return predicted, truth, seconds / done

@@ -143,8 +143,29 @@ class _Status:
 
 
 @contextlib.contextmanager
-def counting_progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
-    """Shows how many of `total` pairs are done; call what it yields with each number of new ones."""
+def counting_progress(
+    total: int, label: str, *, console: Console | None = None
+) -> Iterator[Callable[[int], None]]:
+    """Shows how many of `total` pairs are done, and at the end how many that was a second.
+
+    Call what it yields with each number of new ones. On a terminal this is a bar with the time left,
+    elsewhere a line now and then. The throughput is that of the whole run: compiling, and making the
+    pairs, are in it.
+    """
+    console, begin = console or Console(), time.monotonic()
+    show = _counting_bar if console.is_terminal else _counting_lines
+    with show(total, label, console) as advance:
+        yield advance
+    text = f"{label}: {_throughput(total, time.monotonic() - begin)}"
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def _throughput(pairs: int, seconds: float) -> str:
+    return f"{pairs} pairs in {seconds:.1f} s, {pairs / max(seconds, 1e-9):.1f} pairs/s"
+
+
+@contextlib.contextmanager
+def _counting_bar(total: int, label: str, console: Console) -> Iterator[Callable[[int], None]]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=None),
@@ -152,6 +173,23 @@ def counting_progress(total: int, label: str) -> Iterator[Callable[[int], None]]
         TextColumn("pairs, left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(label, total=total)
-        yield lambda done: progress.advance(task, done)
+        yield lambda new: progress.advance(task, new)
+
+
+@contextlib.contextmanager
+def _counting_lines(total: int, label: str, console: Console) -> Iterator[Callable[[int], None]]:
+    done, begin = 0, time.monotonic()
+    last = begin
+
+    def advance(new: int) -> None:
+        nonlocal done, last
+        done, now = done + new, time.monotonic()
+        if now - last < _SECONDS_BETWEEN_LINES or done >= total:
+            return
+        last, left = now, (total - done) * (now - begin) / done
+        text = f"{label}: {done}/{total}, {_throughput(done, now - begin)}, about {left:.0f} s left"
+        console.print(text, highlight=False, soft_wrap=True)
+
+    yield advance

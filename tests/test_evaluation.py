@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg import evaluation
-from jaxreg.config import PairConfig, RefineConfig
+from jaxreg.config import ModelConfig, PairConfig, RefineConfig
+from jaxreg.model import init_variables
 from jaxreg.types import RigidTransform
 
 pytestmark = pytest.mark.float32
@@ -47,6 +48,51 @@ def test_every_pair_is_counted_once_with_its_own_truth(shapes):
         np.testing.assert_array_equal, truth, evaluation.true_transforms(batches(shapes, 3))
     )
     assert seconds >= 0
+
+
+@pytest.fixture(scope="module")
+def network():
+    """A small network as a method."""
+    config = ModelConfig(k=3, k_matching=3, channels=(4,), width=4, n_inliers=8, iterations=1)
+    variables = jax.jit(lambda: init_variables(jax.random.key(0), config))()
+    return evaluation.network_method(variables, config)
+
+
+def test_all_of_modelnet_in_constant_memory_and_one_compilation(network, seed, caplog):
+    """As many pairs as ModelNet40 has test shapes; the last batch is half full."""
+    shapes = np.random.default_rng(seed).normal(size=(2468, 16, 3)).astype(np.float32)
+    arrays, compiled = [], []
+
+    def progress(count):
+        arrays.append(len(jax.live_arrays()))
+        compiled.append(sum(text.startswith("Compiling") for text in caplog.messages))
+
+    with jax.log_compiles():
+        predicted, truth, _ = evaluation.evaluate_method(network, batches(shapes, 8), progress)
+    assert predicted.rotation.shape == truth.rotation.shape == (2468, 3, 3)
+    assert len(arrays) == 309
+    assert compiled[0] > 0, "the first batch compiles"
+    assert set(compiled) == {compiled[0]}, "no other does, the last neither"
+    assert set(arrays[1:]) == {arrays[1]}
+
+
+def test_a_shorter_last_batch_and_a_hoard_would_be_seen(network, seed, caplog):
+    shapes = np.random.default_rng(seed).normal(size=(20, 16, 3)).astype(np.float32)
+    hoard, arrays, compiled = [], [], []
+
+    def cut(stream):
+        for pair, count in stream:
+            hoard.append(jax.tree.map(lambda x, c=count: x[:c], pair))
+            yield hoard[-1], count
+
+    def progress(count):
+        arrays.append(len(jax.live_arrays()))
+        compiled.append(sum(text.startswith("Compiling") for text in caplog.messages))
+
+    with jax.log_compiles():
+        evaluation.evaluate_method(network, cut(batches(shapes, 8)), progress)
+    assert compiled[2] > compiled[1] == compiled[0]
+    assert arrays[2] > arrays[1] > arrays[0]
 
 
 def test_identity_is_the_identity(shapes):

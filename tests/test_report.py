@@ -70,3 +70,31 @@ def test_the_loss_shown_is_a_running_mean():
     entries = [{"step": 1, "loss": 1.0}, {"step": 2, "loss": 2.0}]
     lines = run(Console(file=io.StringIO()), entries, 2).splitlines()
     assert "loss 1.05" in lines[1]
+
+
+def count(console, parts, total, monkeypatch, seconds_a_part):
+    clock = iter(range(0, 10**6, seconds_a_part))
+    monkeypatch.setattr(report.time, "monotonic", lambda: float(next(clock)))
+    with report.counting_progress(total, "icp", console=console) as progress:
+        for part in parts:
+            progress(part)
+    return console.file.getvalue().splitlines()
+
+
+def test_counting_without_a_terminal_prints_lines_and_the_throughput(monkeypatch):
+    console = Console(file=io.StringIO(), width=40)
+    # The clock is read when the run and when its lines begin, at every part, and at the end.
+    lines = count(console, [8, 8, 8, 4], 28, monkeypatch, seconds_a_part=15)
+    assert [line.split(",")[0] for line in lines[:-1]] == ["icp: 16/28"]
+    assert "about 22 s left" in lines[0]
+    assert lines[-1] == "icp: 28 pairs in 90.0 s, 0.3 pairs/s"
+
+
+def test_counting_on_a_terminal_is_a_bar_and_the_throughput_stays():
+    console = Console(file=io.StringIO(), width=100, force_terminal=True, color_system=None)
+    with report.counting_progress(12, "icp", console=console) as progress:
+        for part in (8, 4):
+            progress(part)
+    text = console.file.getvalue()
+    assert "12/12" in text
+    assert "icp: 12 pairs in" in text.splitlines()[-1]
