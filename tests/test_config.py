@@ -2,10 +2,15 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 
 from jaxreg.config import Config, ModelConfig, from_dict, load_config, to_dict
+from jaxreg.data import pair_sizes
+from jaxreg.pretrained import available_weights
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 
 @pytest.fixture
@@ -102,3 +107,11 @@ def test_missing_files_are_named(tmp_path):
         load_config(tmp_path / "none.toml")
     with pytest.raises(ValueError, match="cannot be read"):
         load_config(tmp_path)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_given_configuration_reads_and_names_weights_that_are_there(path):
+    config = load_config(path)
+    assert config.weights in ("", *available_weights())
+    assert f"configs/{path.name}" in path.read_text("utf-8"), "says how it is run"
+    assert pair_sizes(config.test_pairs, 2 * config.test_pairs.points)[0] >= config.model.n_inliers
