@@ -6,8 +6,10 @@
 import contextlib
 import io as streams
 import json
+import os
 import re
 import shlex
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -90,6 +92,30 @@ def test_guides_print_what_they_say(folder, name):
     for match, printed in run_blocks(PAGES[name].read_text(encoding="utf-8")):
         if printed is not None:
             compare(match[3] or "", printed)
+
+
+@pytest.mark.slow
+def test_training_on_a_folder_runs_as_its_guide_says(folder):
+    blocks = [match for match, _ in run_blocks(PAGES["train-on-your-own-clouds"].read_text())]
+    commands = [
+        line
+        for kind, code, _ in (b.groups() for b in blocks)
+        if kind == "sh"
+        for line in code.splitlines()
+    ]
+    short = "--train.steps 2 --train.validate-every 1 --train.validation-pairs 2"
+    outputs = []
+    for command, options in zip(commands[:2], (short, "--pairs 2"), strict=True):
+        _, script, config, *rest = shlex.split(command)
+        done = subprocess.run(
+            [sys.executable, ROOT / script, ROOT / config, *rest, *options.split()],
+            env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache")},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        outputs.append(done.stdout)
+    assert "curves.png: runs/own" in outputs[0]
+    assert (folder / "runs" / "own" / "curves.png").is_file()
+    assert "MAE(R) deg" in outputs[1]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
