@@ -28,7 +28,7 @@ def figures(result: ScanRegistration) -> dict[str, str]:
     refined = bool(deviations.any())
     return {
         "rotation": f"{angle:.3f} deg",
-        "translation": ", ".join(f"{x:.6g}" for x in result.translation),
+        "translation": ", ".join(f"{x:.9g}" for x in result.translation),
         "overlap": f"{result.overlap:.2f}",
         "fitness": f"{result.fitness:.2f} within {result.reach:.4g}",
         "inlier rmse": f"{result.inlier_rmse:.4g}",

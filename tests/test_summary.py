@@ -50,7 +50,7 @@ def test_figures_have_units(result):
     # The largest standard deviations: 2e-3 rad and 0.03.
     assert told["one sigma"] == f"{np.degrees(2e-3):.2g} deg, 0.03"
     assert told["weak directions"] == "one\nanother"
-    assert told["translation"] == "1e+06, -2, 0.5"
+    assert told["translation"] == "1000000, -2, 0.5"
 
 
 def test_nothing_is_claimed_without_a_refinement(result):

@@ -1,6 +1,5 @@
 """NumPy's own files: NPY with an array (n, 3), NPZ with such an array in it. Never unpickled."""
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ def read(path: Path) -> np.ndarray:
             content = np.load(file, allow_pickle=False)
             if not isinstance(content, np.ndarray):
                 content = {name: content[name] for name in content.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
         hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
         raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
     return _chosen(content, path) if isinstance(content, dict) else _points(content, str(path))

@@ -9,7 +9,11 @@ def read(path: Path) -> np.ndarray:
     """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
     laspy = _laspy(path)
     try:
-        return np.asarray(laspy.read(path).xyz, np.float64)
+        with laspy.open(path) as file:
+            # A scan takes two bytes a point or more; a damaged count would be unpacked for minutes.
+            if file.header.point_count > path.stat().st_size:
+                raise ValueError(f"it announces {file.header.point_count} points")
+            return np.asarray(file.read().xyz, np.float64)
     except Exception as error:  # noqa: BLE001 - laspy and its backends raise types of their own
         raise ValueError(
             f"{path} cannot be read as {path.suffix} ({type(error).__name__}: {error}): "

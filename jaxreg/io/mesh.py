@@ -35,6 +35,8 @@ def read(path: Path) -> np.ndarray:
     if isinstance(shape, trimesh.Scene):
         shape = shape.to_geometry()
     vertices = np.asarray(getattr(shape, "vertices", np.empty((0, 3))), np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"{path}: its vertices have no three coordinates: export it again.")
     faces = getattr(shape, "faces", ())
     if len(faces) == 0:
         return vertices

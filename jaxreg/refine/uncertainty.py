@@ -62,7 +62,7 @@ class WeakDirection(NamedTuple):
     @property
     def name(self) -> str:
         """For people: "rotation about axis (0.00, 0.00, 1.00)"."""
-        axis = ", ".join(f"{value:.2f}" for value in self.axis + 0.0)
+        axis = ", ".join(f"{value:.2f}" for value in np.round(self.axis, 2) + 0.0)
         verb = {"rotation": "rotation about axis", "screw": "screw motion about axis"}
         return f"{verb.get(self.kind, 'translation along')} ({axis})"
 

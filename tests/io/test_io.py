@@ -66,6 +66,14 @@ def test_ascii_ply_with_windows_line_ends(tmp_path):
     np.testing.assert_array_equal(io.read_cloud(tmp_path / "a.ply"), [[1, 2, 3], [4, 5, 6]])
 
 
+def test_binary_ply_with_windows_line_ends_in_its_header(tmp_path):
+    head = "ply\nformat binary_big_endian 1.0\nelement vertex 2\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    rows = struct.pack(">6f", 1, 2, 3, 4, 5, 6)
+    (tmp_path / "a.ply").write_bytes(head.replace("\n", "\r\n").encode() + rows)
+    np.testing.assert_array_equal(io.read_cloud(tmp_path / "a.ply"), [[1, 2, 3], [4, 5, 6]])
+
+
 def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
     kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4")]
     rows = np.zeros(3, [*kinds, ("red", "u1")])
@@ -151,9 +159,10 @@ CUBE_OFF = (
 )
 
 
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
 @pytest.mark.parametrize("head", ["OFF\n", "OFF", "OFF "])
-def test_off_of_modelnet_even_with_its_glued_first_line(tmp_path, head):
-    (tmp_path / "cube.off").write_text(head + CUBE_OFF)
+def test_off_of_modelnet_even_with_its_glued_first_line(tmp_path, head, line_end):
+    (tmp_path / "cube.off").write_bytes((head + CUBE_OFF).replace("\n", line_end).encode())
     cloud = io.read_cloud(tmp_path / "cube.off")
     on_surface = np.min(np.minimum(np.abs(cloud), np.abs(cloud - 1)), axis=1)
     assert len(cloud) > 1000

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import trimesh
 
 from jaxreg import io
 
@@ -73,6 +74,31 @@ def test_malformed_file_is_named_with_place_and_remedy(tmp_path, name):
     with pytest.raises(ValueError, match=told) as caught:
         io.read_cloud(tmp_path / name)
     assert name in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [*io.WRITABLE, ".obj", ".off", ".stl"])
+def test_damaged_files_are_read_or_refused_by_name(tmp_path, seed, suffix):
+    """Cut anywhere, or with bytes changed: a cloud or a ValueError, and nothing else."""
+    rng = np.random.default_rng(seed)
+    if suffix in (".las", ".laz"):
+        pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    path = tmp_path / f"scan{suffix}"
+    if suffix in io.WRITABLE:
+        io.write_cloud(path, rng.normal(size=(30, 3)))
+    else:
+        trimesh.creation.icosphere(subdivisions=1).export(path)
+    whole = path.read_bytes()
+    for i in range(40):
+        damaged = bytearray(whole[: rng.integers(1, len(whole))] if i % 2 else whole)
+        for _ in range(0 if i % 2 else rng.integers(1, 6)):
+            damaged[rng.integers(0, min(len(damaged), 400))] = rng.integers(0, 256)
+        path.write_bytes(damaged)
+        try:
+            cloud = io.read_cloud(path)
+        except ValueError as error:
+            assert str(path) in str(error)  # noqa: PT017 - either outcome is right
+        else:
+            assert (cloud.ndim, cloud.shape[1], cloud.dtype) == (2, 3, np.float64)
 
 
 def test_missing_file(tmp_path):

@@ -1,0 +1,168 @@
+"""The guides and the notebook run as they stand and print what they say.
+
+`python tests/test_docs.py` runs the guides and writes what they print into them.
+"""
+
+import contextlib
+import io as streams
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxreg import cli, compilation
+from jaxreg.config import load_config
+
+pytestmark = [pytest.mark.float32, pytest.mark.loose]
+
+ROOT = Path(__file__).parents[1]
+PAGES = {path.stem: path for path in sorted((ROOT / "docs").glob("*.md")) if path.stem != "README"}
+# What these need is compiled by no other test; the other pages run in every suite.
+SLOW = ("read-the-results", "use-it-inside-your-jax-code")
+NOTEBOOKS = {path.stem: path for path in sorted((ROOT / "examples").glob("*.ipynb"))}
+BLOCK = re.compile(r"```(python|sh)\n(.*?)```\n(?:\n```\n(.*?)```\n)?", re.DOTALL)
+
+
+def run_python(code: str, names: dict) -> str:
+    with contextlib.redirect_stdout(streams.StringIO()) as printed:
+        exec(compile(code, "example", "exec"), names)  # noqa: S102
+    return printed.getvalue()
+
+
+def run_shell(code: str) -> str | None:
+    """What lines `jaxreg ...` and `echo $?` print; None for other programs, which are not run."""
+    if not code.startswith("jaxreg "):
+        return None
+    status = 0
+    with (
+        contextlib.redirect_stdout(streams.StringIO()) as printed,
+        contextlib.redirect_stderr(printed),
+    ):
+        for line in code.splitlines():
+            if line == "echo $?":
+                print(status)
+            else:
+                status = cli.main(shlex.split(line)[1:])
+    return printed.getvalue()
+
+
+def run_blocks(text: str):
+    """The match, and what was printed (None where nothing was run), of every block of a page."""
+    names = {}
+    for match in BLOCK.finditer(text):
+        kind, code, _ = match.groups()
+        yield match, run_python(code, names) if kind == "python" else run_shell(code)
+
+
+def comparable(text: str) -> tuple[list[str], np.ndarray]:
+    """The words, and the numbers, of lines that do not tell a time."""
+    lines = [line for line in text.splitlines() if not re.search(r"^time|seconds|\bs$", line)]
+    numbers = re.findall(r"(?<![\w.])-?\d[\d,]*\.?\d*(?:e[-+]?\d+)?", "\n".join(lines))
+    words = re.findall(r"[A-Za-z]{3,}", "\n".join(lines))
+    return words, np.array([float(number.replace(",", "")) for number in numbers])
+
+
+def compare(promised: str, printed: str) -> None:
+    """Equal words; numbers that differ by no more than another machine's rounding may cause."""
+    (words, numbers), (other_words, others) = comparable(promised), comparable(printed)
+    assert words == other_words, printed
+    assert numbers.shape == others.shape, printed
+    np.testing.assert_allclose(others, numbers, rtol=0.1, atol=0.05, err_msg=printed)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty folder to run in, and no compilation cache."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(compilation, "enable_compilation_cache", lambda **_: None)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in PAGES]
+)
+def test_guides_print_what_they_say(folder, name):
+    for match, printed in run_blocks(PAGES[name].read_text(encoding="utf-8")):
+        if printed is not None:
+            compare(match[3] or "", printed)
+
+
+@pytest.mark.slow
+def test_training_on_a_folder_runs_as_its_guide_says(folder):
+    blocks = [match for match, _ in run_blocks(PAGES["train-on-your-own-clouds"].read_text())]
+    commands = [
+        line
+        for kind, code, _ in (b.groups() for b in blocks)
+        if kind == "sh"
+        for line in code.splitlines()
+    ]
+    short = "--train.steps 2 --train.validate-every 1 --train.validation-pairs 2"
+    outputs = []
+    for command, options in zip(commands[:2], (short, "--pairs 2"), strict=True):
+        _, script, config, *rest = shlex.split(command)
+        done = subprocess.run(
+            [sys.executable, ROOT / script, ROOT / config, *rest, *options.split()],
+            env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache")},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        outputs.append(done.stdout)
+    assert "curves.png: runs/own" in outputs[0]
+    assert (folder / "runs" / "own" / "curves.png").is_file()
+    assert "MAE(R) deg" in outputs[1]
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebooks_print_what_they_show(folder, name, monkeypatch):
+    display = types.SimpleNamespace(Image=lambda path, width: Path(path).read_bytes())
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    cells = json.loads(NOTEBOOKS[name].read_text(encoding="utf-8"))["cells"]
+    names, ran = {}, 0
+    for cell in cells:
+        if cell["cell_type"] != "code":
+            continue
+        shown = [out["text"] for out in cell["outputs"] if out["output_type"] == "stream"]
+        compare("".join(sum(shown, [])), run_python("".join(cell["source"]), names))
+        ran += 1
+    assert ran >= 4
+
+
+@pytest.mark.parametrize(
+    "path", [*PAGES.values(), ROOT / "docs" / "README.md"], ids=lambda p: p.stem
+)
+def test_links_and_configurations_of_guides_exist(path):
+    text = path.read_text(encoding="utf-8")
+    for name in re.findall(r"\]\(([^)h#][^)#]*)", text):
+        assert (path.parent / name).exists(), name
+    for name in re.findall(r"configs/\w+\.toml", text):
+        load_config(ROOT / name)
+
+
+def write_pages() -> None:
+    """Run every guide in a folder of its own and put what it printed below each block.
+
+    Run it twice: the second time nothing is compiled, and the seconds are those of a usual run.
+    """
+    import tempfile
+
+    compilation.enable_compilation_cache(least_seconds=0.0)
+    for path in PAGES.values():
+        text, pieces, end = path.read_text(encoding="utf-8"), [], 0
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            for match, printed in run_blocks(text):
+                stop = match.end() if printed is None else match.end(2)
+                pieces += [text[end:stop]]
+                if printed is not None:
+                    pieces += ["```\n", f"\n```\n{printed}```\n" if printed else ""]
+                end = match.end()
+        path.write_text("".join([*pieces, text[end:]]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(write_pages())
