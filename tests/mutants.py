@@ -47,6 +47,12 @@ MUTANTS = [
         "test_small_and_flat_angles_keep_their_digits",
     ),
     Mutant(
+        "numerics",
+        "x[:half], x[x.shape[0] - half :]",
+        "x[:half], x[:half]",
+        "test_leading_max_is_numpy_s_and_hands_its_derivative_to_the_largest",
+    ),
+    Mutant(
         "rigid",
         "points, transform.rotation.T,",
         "points, transform.rotation,",
@@ -124,11 +130,17 @@ MUTANTS = [
         "points[:, None] - points[neighbors]",
         "test_relative_coordinates_point_from_the_centre_to_the_neighbour",
     ),
-    Mutant("features", "jnp.max(x, axis=0)", "jnp.mean(x, axis=0)", "test_features_edge_by_edge"),
+    Mutant("features", "leading_max(x)", "jnp.mean(x, axis=0)", "test_features_edge_by_edge"),
+    Mutant(
+        "features",
+        "count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)",
+        "count = jax.lax.psum(1, BATCH_AXIS) * jnp.maximum(jnp.sum(weight), 1)",
+        "test_batch_statistics_run_over_all_valid_points_of_all_clouds",
+    ),
     Mutant(
         "matching",
-        "jax.nn.softmax(-distance, axis=1)",
-        "jax.nn.softmax(-distance, axis=0)",
+        "weight / jnp.sum(weight, axis=1, keepdims=True)",
+        "weight / jnp.sum(weight, axis=0, keepdims=True)",
         "test_scores_are_a_softmax_over_the_reference",
     ),
     Mutant(
@@ -228,8 +240,10 @@ MUTANTS = [
 ]
 
 
-def killer(mutant: Mutant) -> str | None:
+def killer(mutant: Mutant, cache: str) -> str | None:
     """Name of the test that fails for a mutant; None when it survives.
+
+    What a mutant does not change was compiled for another one, and is found in `cache`.
 
     Raises:
       ValueError: the module does not hold the text exactly once, or the test did not run.
@@ -248,7 +262,14 @@ def killer(mutant: Mutant) -> str | None:
         path.write_text(source.replace(mutant.text, mutant.mutated), encoding="utf-8")
         test = f"tests/test_{mutant.module}.py::{mutant.test}"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", test]
-        result = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+        environment = os.environ | {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+        result = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True, check=False
+        )
     if result.returncode not in (0, 1):
         raise ValueError(f"{test} did not run: {result.stdout[-2000:]}{result.stderr[-2000:]}")
     failed = re.search(r"^FAILED \S+::(\S+)", result.stdout, re.MULTILINE)
@@ -259,8 +280,13 @@ def main() -> None:
     """Run the mutants, two at a time; exit 1 when one survives."""
     chosen = [m for m in MUTANTS if not sys.argv[1:] or m.module in sys.argv[1:]]
     survivors = 0
-    with concurrent.futures.ThreadPoolExecutor(min(2, os.cpu_count() or 1)) as pool:
-        for mutant, test in zip(chosen, pool.map(killer, chosen), strict=True):
+    with (
+        tempfile.TemporaryDirectory() as cache,
+        concurrent.futures.ThreadPoolExecutor(min(2, os.cpu_count() or 1)) as pool,
+    ):
+        for mutant, test in zip(
+            chosen, pool.map(killer, chosen, [cache] * len(chosen)), strict=True
+        ):
             survivors += test is None
             print(f"{mutant.module}: {mutant.text}  ->  {mutant.mutated}")
             print(f"    {'SURVIVED ' + mutant.test if test is None else 'killed by ' + test}")

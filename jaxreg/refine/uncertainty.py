@@ -6,6 +6,7 @@ that slide along a surface are the same surface to any scanner.
 
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -164,11 +165,35 @@ def weak_directions(
     return tuple(sorted(found, key=lambda direction: direction.strength))
 
 
+@jax.custom_jvp
 def _bounded_inverse(information: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
+    """The inverse with every eigenvalue raised to a floor, a constant of the derivative."""
+    _, raised, vectors = _raised_eigenvalues(information)
+    return jnp.matmul(vectors / raised[None, :], vectors.T, precision="highest")
+
+
+@_bounded_inverse.defjvp
+def _bounded_inverse_jvp(primals, tangents):
+    """``V (F * (V^T dA V)) V^T`` with F the divided differences of ``1 / max(l, floor)``.
+
+    The derivative of eigenvectors divides by the gaps of eigenvalues and is NaN at a ball or a cube;
+    that of a function of the matrix is the slope of the function where two of them are equal.
+    """
+    values, raised, vectors = _raised_eigenvalues(primals[0])
+    gap = values[:, None] - values[None, :]
+    slope = (raised[:, None] - raised[None, :]) / jnp.where(gap == 0, 1, gap)
+    slope = jnp.where(gap == 0, (raised == values)[:, None], slope)
+    turned = jnp.matmul(vectors.T, (tangents[0] + tangents[0].T) / 2, precision="highest")
+    change = jnp.matmul(turned, vectors, precision="highest")
+    change = -slope * change / (raised[:, None] * raised[None, :])
+    change = jnp.matmul(vectors, change, precision="highest")
+    return _bounded_inverse(*primals), jnp.matmul(change, vectors.T, precision="highest")
+
+
+def _raised_eigenvalues(information: Float[Array, "6 6"]):
     values, vectors = jnp.linalg.eigh(information)
     floor = _SMALLEST_EIGENVALUE * values[-1]
-    values = jnp.where(values[-1] > 0, jnp.maximum(values, floor), 1)
-    return jnp.matmul(vectors / values[None, :], vectors.T, precision="highest")
+    return values, jnp.where(values[-1] > 0, jnp.maximum(values, floor), 1), vectors
 
 
 def _upright(axis: np.ndarray) -> np.ndarray:

@@ -1,0 +1,250 @@
+"""Every public function of the numerical rooms under every transform of JAX.
+
+The table below names each one with generic and degenerate inputs. For every row: jit equals eager,
+vmap equals a loop, forward mode equals reverse mode, both are finite, and on generic inputs they equal
+central differences in float64. A public function that is not in the table fails the test.
+"""
+
+import functools
+import importlib
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxreg
+from tests.transforms.core_rows import core_rows
+from tests.transforms.network_rows import network_and_model_rows
+from tests.transforms.refine_rows import refine_rows
+from tests.transforms.rows import Row
+
+HOST = {"config.load_config", "pretrained.available_weights", "pretrained.load_pretrained"}
+HOST |= {"register.register", "refine.frame.check_clouds", "refine.pairing.check_options"}
+HOST |= {"refine.uncertainty.weak_directions"}
+"""Functions that read files or numpy arrays on the host: no transform applies to them."""
+ROOMS = (
+    "numerics",
+    "rigid",
+    "neighbors",
+    "procrustes",
+    "features",
+    "matching",
+    "invariants",
+    "inliers",
+    "model",
+    "losses",
+    "refine.frame",
+    "refine.gauss_newton",
+    "refine.gicp",
+    "refine.icp",
+    "refine.normals",
+    "refine.pairing",
+    "refine.point_to_plane",
+    "refine.uncertainty",
+)
+
+TABLE = core_rows() | network_and_model_rows() | refine_rows()
+
+
+def public_functions() -> set[str]:
+    """Functions and networks that the numerical rooms define under a public name."""
+    names = set()
+    for room in ROOMS:
+        module = importlib.import_module(f"jaxreg.{room}")
+        for name, value in vars(module).items():
+            record = inspect.isclass(value) and issubclass(value, tuple)
+            if name.startswith("_") or not callable(value) or record:
+                continue
+            if getattr(value, "__module__", None) == module.__name__:
+                names.add(f"{room}.{name}")
+    for name in jaxreg.__all__:
+        value = getattr(jaxreg, name)
+        if inspect.isfunction(value):
+            names.add(f"{value.__module__.removeprefix('jaxreg.')}.{name}")
+    return names - HOST
+
+
+def test_every_public_function_is_in_the_table():
+    missing, gone = public_functions() - set(TABLE), set(TABLE) - public_functions()
+    assert not missing, f"give {sorted(missing)} a row in the table of tests/transforms"
+    assert not gone, f"take {sorted(gone)} out of the table of tests/transforms"
+
+
+@pytest.fixture
+def row(request):
+    """A row of the table, with JAX's promotion as it asks for."""
+    row = TABLE[request.param]
+    if row.loose:
+        jax.config.update("jax_numpy_dtype_promotion", "standard")
+    return row
+
+
+def rows(names):
+    return pytest.mark.parametrize(("name", "row"), [(n, n) for n in names], indirect=["row"])
+
+
+each_row = rows(sorted(name for name, row in TABLE.items() if row.generic and not row.parts))
+
+
+def is_float(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def floating(row: Row, inputs: tuple):
+    """The function of its floating inputs and outputs alone, as lists of arrays, and its inputs."""
+    leaves, tree = jax.tree.flatten(inputs)
+    where = [i for i, leaf in enumerate(leaves) if is_float(leaf)]
+
+    def function(values, leaves):
+        leaves = list(leaves)
+        for i, value in zip(where, values, strict=True):
+            leaves[i] = value
+        outputs = jax.tree.leaves(row.function(*jax.tree.unflatten(tree, leaves)))
+        return [x for x in outputs if is_float(x)]
+
+    return function, [leaves[i] for i in where], leaves
+
+
+@functools.cache
+def compiled(name: str) -> tuple[Callable, Callable]:
+    """The value, and both derivatives along directions, of a row; one compilation for each shape."""
+    row = TABLE[name]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def both_modes(shape, values, leaves, direction, cotangent):
+        function, *_ = floating(row, jax.tree.unflatten(shape, leaves))
+
+        def of_values(values):
+            return function(values, leaves)
+
+        outputs, tangent = jax.jvp(of_values, (values,), (direction,))
+        _, pull = jax.vjp(of_values, values)
+        return outputs, tangent, pull(cotangent)[0]
+
+    return both_modes
+
+
+def assert_close(a, b, tolerance):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        x, y = np.asarray(x), np.asarray(y)
+        scale = max(1.0, np.abs(np.where(np.isfinite(y), y, 0)).max(initial=0))
+        np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance * scale)
+
+
+def arrays(inputs):
+    return jax.tree.map(jnp.asarray, inputs)
+
+
+@functools.cache
+def jitted(name: str) -> Callable:
+    return jax.jit(TABLE[name].function)
+
+
+@each_row
+def test_jit_equals_eager(name, row):
+    for inputs in (row.generic, *row.degenerate[:1]):
+        assert_close(jitted(name)(*inputs), row.function(*arrays(inputs)), 1e-10)
+
+
+@each_row
+def test_vmap_equals_a_loop(name, row):
+    leaves, tree = jax.tree.flatten(row.generic)
+    batch = [
+        np.stack([x, 0.9 * x, x[::-1] if np.ndim(x) else x]) if is_float(x) else np.stack([x] * 3)
+        for x in leaves
+    ]
+    together = jax.jit(jax.vmap(row.function))(*jax.tree.unflatten(tree, batch))
+    for i in range(3):
+        one = jitted(name)(*jax.tree.unflatten(tree, [x[i] for x in batch]))
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), one, 1e-9)
+
+
+def derivatives(name, row, inputs, rng):
+    """A random direction, outputs, both derivatives, and a function of a step along the direction.
+
+    The inner products of the forward and of the reverse derivative with a random cotangent, which
+    must be equal, come last.
+    """
+    _, values, leaves = floating(row, inputs)
+    direction = [rng.normal(size=np.shape(x)) for x in values]
+    tree = jax.tree.structure(inputs)
+    shapes = jax.eval_shape(floating(row, inputs)[0], values, leaves)
+    cotangent = [rng.normal(size=x.shape) for x in shapes]
+
+    def at(step):
+        moved = [x + step * d for x, d in zip(values, direction, strict=True)]
+        return compiled(name)(tree, moved, leaves, direction, cotangent)
+
+    outputs, tangent, gradient = at(0.0)
+    forward = sum(np.sum(c * t) for c, t in zip(cotangent, tangent, strict=True))
+    reverse = sum(np.sum(d * g) for d, g in zip(direction, gradient, strict=True))
+    return outputs, tangent, gradient, at, (forward, reverse)
+
+
+DIFFERENTIABLE = sorted(name for name, row in TABLE.items() if row.generic)
+
+
+@rows(DIFFERENTIABLE)
+def test_derivatives_at_generic_inputs(name, row, seed):
+    rng = np.random.default_rng(seed)
+    _, tangent, gradient, at, products = derivatives(name, row, row.generic, rng)
+    for x in (*tangent, *gradient):
+        assert np.isfinite(x).all()
+    np.testing.assert_allclose(*products, rtol=1e-9, atol=1e-10)
+    if not row.smooth:
+        return
+    step = 1e-6
+    for t, a, b in zip(tangent, at(step)[0], at(-step)[0], strict=True):
+        difference = (np.asarray(a) - np.asarray(b)) / (2 * step)
+        scale = max(1.0, np.abs(difference).max(initial=0))
+        np.testing.assert_allclose(t, difference, rtol=1e-6, atol=1e-7 * scale)
+
+
+@rows([name for name in DIFFERENTIABLE if TABLE[name].degenerate])
+def test_derivatives_are_finite_and_modes_agree_at_degenerate_inputs(name, row, seed):
+    rng = np.random.default_rng(seed)
+    for number, inputs in enumerate(row.degenerate):
+        outputs, tangent, gradient, _, (forward, reverse) = derivatives(name, row, inputs, rng)
+        for x in (*outputs, *tangent, *gradient):
+            assert np.isfinite(x).all(), f"degenerate input {number}"
+        size = max(1.0, abs(forward))
+        if row.kinks:
+            assert max(abs(forward), abs(reverse)) < 1e6, f"degenerate input {number}"
+        else:
+            message = f"degenerate input {number}"
+            np.testing.assert_allclose(reverse, forward, atol=1e-7 * size, err_msg=message)
+
+
+@rows(["losses.step_losses"])
+def test_derivatives_do_not_need_a_number_computed_twice_to_be_the_same(name, row, seed):
+    """Without LLVM's optimisation a kernel that computes a number anew rounds it differently.
+
+    The derivative of `jnp.max` is then NaN: it divides by the number of entries equal to it.
+    """
+    function, values, leaves = floating(row, row.generic)
+    rng = np.random.default_rng(seed)
+    direction = [rng.normal(size=np.shape(x)) for x in values]
+
+    def both(values, direction):
+        outputs, tangent = jax.jvp(lambda x: function(x, leaves), (values,), (direction,))
+        _, pull = jax.vjp(lambda x: function(x, leaves), values)
+        return outputs, tangent, pull([jnp.ones_like(x) for x in outputs])[0]
+
+    plain = {"xla_backend_optimization_level": 0}
+    outputs, tangent, gradient = jax.jit(both, compiler_options=plain)(values, direction)
+    forward = sum(np.sum(t) for t in tangent)
+    reverse = sum(np.sum(d * g) for d, g in zip(direction, gradient, strict=True))
+    assert all(np.isfinite(x).all() for x in outputs)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize(
+    "row", ["neighbors.knn", "numerics.included_angle", "rigid.apply"], indirect=True
+)
+def test_numpy_arrays_are_welcome(row):
+    assert_close(row.function(*row.generic), row.function(*arrays(row.generic)), 1e-12)
