@@ -114,7 +114,8 @@ def simple_table(title: str, rows: list[dict]) -> Table:
     """A table of rows of equal keys: seconds to two digits, the rest as it is."""
     table = Table(title=title, title_justify="left")
     for number, name in enumerate(rows[0]):
-        table.add_column(name, justify="left" if number == 0 else "right")
+        first = number == 0
+        table.add_column(name, justify="left" if first else "right", no_wrap=first)
     for row in rows:
         table.add_row(*(f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()))
     return table
@@ -193,9 +194,9 @@ def programs(options: Options) -> list[dict]:
                 "trace, s": first["trace_s"],
                 "compile, s": first["compile_s"],
                 "peak, MB": round(first["peak_mb"]),
-                "before it compiles": round(first["before_mb"]),
+                "before": round(first["before_mb"]),
                 "arrays": round(first["temporary_mb"]),
-                "peak, warm cache": round(second["peak_mb"]),
+                "peak, warm": round(second["peak_mb"]),
             }
         )
     return rows

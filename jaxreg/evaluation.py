@@ -117,7 +117,9 @@ def evaluate_method(
         seconds += time.perf_counter() - begin
         done += pair.source.mask.shape[0]
         # Copies: a numpy view would keep the array that it looks at alive on the device.
-        results.append(jax.tree.map(lambda x, c=count: np.array(x)[:c], (predicted, pair.transform)))
+        results.append(
+            jax.tree.map(lambda x, c=count: np.array(x)[:c], (predicted, pair.transform))
+        )
         progress(count)
     predicted, truth = jax.tree.map(lambda *parts: np.concatenate(parts), *results)
     return predicted, truth, seconds / done
