@@ -53,11 +53,9 @@ def registered(folder):
     """The folder after one run with everything, its exit status and what it printed."""
     outputs = ["-o", "out.ply", "--json", "r.json", "--plot", "r.png", "--html", "r.html"]
     files = [str(folder / part) if "." in part else part for part in ("a.ply", "b.pcd", *outputs)]
-    # What the features find is believed: the dense path would be one more compilation.
-    arguments = ["register", *files, "--config.convincing", "0"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compilation, "enable_compilation_cache", lambda **_: None)
-        return folder, cli.main(arguments)
+        return folder, cli.main(["register", *files])
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
