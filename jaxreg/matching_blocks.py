@@ -92,14 +92,15 @@ def _row_sum(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
 
 def _by_columns(function: Callable, x: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """`function` of some columns of `x` at a time, written back in their place."""
-    whole, rest = divmod(x.shape[1], BLOCK)
+    size = min(BLOCK, x.shape[1])
+    whole, rest = divmod(x.shape[1], size)
 
     def replace(x, start, width):
         part = function(jax.lax.dynamic_slice_in_dim(x, start, width, axis=1))
         return jax.lax.dynamic_update_slice_in_dim(x, part, start, axis=1)
 
-    x = jax.lax.fori_loop(0, whole, lambda i, x: replace(x, i * BLOCK, BLOCK), x)
-    return replace(x, whole * BLOCK, rest) if rest else x
+    x = jax.lax.fori_loop(0, whole, lambda i, x: replace(x, i * size, size), x)
+    return replace(x, whole * size, rest) if rest else x
 
 
 def _by_rows(function: Callable, *arrays: Float[Array, "n _"]) -> Any:

@@ -72,8 +72,8 @@ MUTANTS = [
     ),
     Mutant(
         "neighbors",
-        "order[None, :] == jnp.arange(n)[:, None]",
-        "jnp.zeros((n, n), bool)",
+        "excluded = order[None, :] == row[:, None]",
+        "excluded = jnp.zeros((len(row), n), bool)",
         "test_knn_gives_the_k_nearest_other_points",
     ),
     Mutant(
@@ -160,8 +160,8 @@ MUTANTS = [
     ),
     Mutant(
         "matching",
-        "_two_passes(_collect, x",
-        "_two_passes(_gather, x",
+        "_two_passes(collect_rows, x",
+        "_two_passes(gather_rows, x",
         "test_derivative_of_the_neighborhood_sum_is_its_transpose",
     ),
     Mutant(

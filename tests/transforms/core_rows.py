@@ -11,6 +11,7 @@ from jaxreg import (
     invariants,
     losses,
     matching,
+    matching_blocks,
     neighbors,
     numerics,
     procrustes,
@@ -39,6 +40,12 @@ def maps_of(distance, nearest, source_idx, reference_idx):
     return matching.matching_maps(distance, nearest, *graphs, alpha=0.7)
 
 
+def in_blocks(source, reference, source_idx, reference_idx, points):
+    graphs = matching.incidence(source_idx), matching.incidence(reference_idx)
+    branch = matching_blocks.Branch(source, reference, *graphs)
+    return matching_blocks.match_in_blocks((branch,), points, alpha=0.7)
+
+
 def core_rows() -> dict[str, Row]:
     idx, inlier_idx = neighbor_graph(), np.array([1, 4, 5, 0], np.int32)
     valid, mask = np.ones(4, bool), np.ones(N, bool)
@@ -60,9 +67,6 @@ def core_rows() -> dict[str, Row]:
             numerics.leading_max,
             (points(),),
             ((np.zeros((3, 4)),), (np.repeat(points(2), 3, axis=0),)),
-        ),
-        "numerics.row_min": Row(
-            numerics.row_min, (RNG.normal(size=(4, 21)),), ((np.zeros((3, 21)),),)
         ),
         "numerics.included_angle": Row(
             numerics.included_angle,
@@ -163,8 +167,13 @@ def core_rows() -> dict[str, Row]:
         ),
         "matching.match": Row(
             matching.match,
-            (matching.Maps(scores, scores.T, scores**2), points()),
-            ((matching.Maps(*(np.full((N, N), 1 / N),) * 3), np.ones((N, 3))),),
+            (scores.T, scores**2, points()),
+            ((*(np.full((N, N), 1 / N),) * 2, np.ones((N, 3))),),
+        ),
+        "matching_blocks.match_in_blocks": Row(
+            in_blocks,
+            (RNG.normal(size=(N, 4)), RNG.normal(size=(N, 4)), idx, idx, points()),
+            ((np.ones((N, 4)), np.ones((N, 4)), idx, idx, np.ones((N, 3))),),
         ),
         "invariants.edges": Row(lengths, (points(), idx), every(lambda x: (x, idx))),
         "invariants.included_angles": Row(
