@@ -14,6 +14,10 @@ Types. The jaxtyping hook has beartype check every signature of jaxreg: when tra
 compiled code is as fast as without it. It sees a wrong shape before the function does; mark a test
 of the function's own `ValueError` with `pytest.mark.untyped`.
 
+Compilation. The tests compile a thousand programs that run for a millisecond, so LLVM optimises
+nothing here (a third of the time of the suite); XLA's own passes run as ever, and the processes that
+some tests start (the README, examples, the command line) compile as a user's do.
+
 Seeds. A random test takes the `seed` fixture. It is the same in every run unless `--seed N` (or
 `--seed random`) says otherwise, and it is printed with the failure.
 """
@@ -30,6 +34,11 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 mpl.use("Agg")
+with pytest.MonkeyPatch.context() as patch:
+    flags = os.environ.get("XLA_FLAGS", "")
+    patch.setenv("XLA_FLAGS", f"{flags} --xla_backend_optimization_level=0")
+    jax.devices()  # reads the flags, once
+
 # With the numeric tower an int is a float, as every type checker has it.
 jaxtyping.install_import_hook(
     "jaxreg", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
