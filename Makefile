@@ -28,8 +28,8 @@ lint: $(VENV)/.installed-dev  ## style, and the order of imports between the roo
 types: $(VENV)/.installed-dev  ## what pyright says (not yet clean: numpy where a jax array is declared)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-fuzz: $(VENV)/.installed-dev  ## the tests with fresh seeds and many more examples
-	$(BIN)/python -m pytest -n 2 -m "not slow" --hypothesis-profile=fuzz --seed=random
+fuzz: $(VENV)/.installed-dev  ## 10,000 examples of whatever may be given to register()
+	$(BIN)/python -m pytest -n 2 tests/test_fuzz.py --hypothesis-profile=fuzz
 
 mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
 	$(BIN)/python tests/mutants.py

@@ -107,4 +107,4 @@ def test_leading_max_is_numpy_s_and_hands_its_derivative_to_the_largest(count, s
     np.testing.assert_array_equal(gradient, (x == x.max(axis=0)).astype(float))
     x[0] = x[-1] = 9.0
     gradient = jax.grad(lambda x: numerics.leading_max(x).sum())(jnp.asarray(x))
-    np.testing.assert_allclose(gradient[0] + gradient[-1] * (count > 1), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(np.sum(gradient, axis=0), 1.0, rtol=1e-15)
