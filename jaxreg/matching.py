@@ -188,6 +188,8 @@ def matching_maps(
         else:
             dual = neighborhood_sum(scores, *graphs) / k
             dual = dual + neighborhood_sum(nearest, *nearest_graphs) / k
+    if valid is not None:  # A padded column has valid neighbours, and could be the peak of a row.
+        dual = jnp.where(valid[None, :], dual, 0)
     dual = checkpoint_name(dual, KEPT[1])
     return Maps(scores, dual, matching_scores(final_distance(total, dual, alpha=alpha), valid))
 

@@ -61,8 +61,9 @@ def match_in_blocks(
     def last(dual, *sources):
         pairs = zip(sources, branches, strict=True)
         distance = sum(feature_distance(x, b.reference) for x, b in pairs)
-        scores = matching_scores(final_distance(distance, dual / k, alpha=alpha), valid)
-        return match(dual / k, scores, reference)
+        dual = dual / k if valid is None else jnp.where(valid[None, :], dual / k, 0)
+        scores = matching_scores(final_distance(distance, dual, alpha=alpha), valid)
+        return match(dual, scores, reference)
 
     matches = _by_rows(last, dual, *(branch.source for branch in branches))
     return jax.tree.map(lambda x: x[:n], matches)

@@ -91,7 +91,7 @@ def geman_mcclure_weights(
     median = jnp.where(jnp.any(counts), ordered[middle], 0)
     # Exact pairs leave nothing but rounding, which is no scale to judge others by.
     rounding = 16 * jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(reference))
-    floor = jnp.maximum(jax.lax.stop_gradient(rounding), jnp.finfo(source.dtype).tiny ** 0.5)
+    floor = jnp.maximum(jax.lax.stop_gradient(rounding), jnp.finfo(source.dtype).tiny ** 0.25)
     scale = 9 * median + floor**2
     return (scale / (scale + square)) ** 2
 

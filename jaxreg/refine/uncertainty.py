@@ -182,7 +182,7 @@ def _bounded_inverse_jvp(primals, tangents):
     values, raised, vectors = _raised_eigenvalues(primals[0])
     gap = values[:, None] - values[None, :]
     slope = (raised[:, None] - raised[None, :]) / jnp.where(gap == 0, 1, gap)
-    slope = jnp.where(gap == 0, (raised == values)[:, None], slope)
+    slope = jnp.where(gap == 0, (raised == values)[:, None].astype(gap.dtype), slope)
     turned = jnp.matmul(vectors.T, (tangents[0] + tangents[0].T) / 2, precision="highest")
     change = jnp.matmul(turned, vectors, precision="highest")
     change = -slope * change / (raised[:, None] * raised[None, :])
