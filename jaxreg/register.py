@@ -122,7 +122,12 @@ def _check_initial(initial: object) -> RigidTransform:
     if isinstance(initial, RigidTransform):
         rotation, translation = (np.asarray(part, np.float64) for part in initial)
     else:
-        matrix = np.asarray(initial, np.float64)
+        try:
+            matrix = np.asarray(initial, np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(
+                "initial is no array of numbers: give a 4x4 matrix [[R, t], [0, 1]]."
+            ) from None
         if matrix.shape != (4, 4):
             raise ValueError(f"initial must be a 4x4 matrix [[R, t], [0, 1]], got {matrix.shape}.")
         rotation, translation = matrix[:3, :3], matrix[:3, 3]

@@ -7,8 +7,6 @@ import pytest
 from jaxreg.register import register
 from tests.scenes import angle_deg, assert_proper, moved, pose, revolved, shape
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture
 def rng(seed):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxreg.register import register
 
-pytestmark = [pytest.mark.slow, pytest.mark.untyped]
+pytestmark = pytest.mark.untyped
 
 EXAMPLES = 10_000 if settings.get_current_profile_name() == "fuzz" else 240
 REMEDY = re.compile(r"give|remove|pass|use|need|at least|must be|drop", re.IGNORECASE)
