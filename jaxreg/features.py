@@ -64,7 +64,7 @@ class _Normalize(nn.Module):
                 batch = batch.astype(running.value.dtype)
                 running.value = self.momentum * running.value + (1 - self.momentum) * batch
         factor = jax.lax.rsqrt(statistics[1] + self.epsilon) * scale
-        return x * factor + (bias - statistics[0] * factor)
+        return (x - statistics[0]) * factor + bias
 
 
 def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
