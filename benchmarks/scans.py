@@ -77,20 +77,28 @@ def ours(rotation: str) -> Callable:
     return lambda x, y: register(x, y, rotation=rotation)
 
 
+def described(x: np.ndarray, y: np.ndarray):
+    """Both clouds reduced to voxels, with normals, and their FPFH, as in Open3D's tutorial."""
+    import open3d as o3d
+
+    clouds, features = [], []
+    for points in (x, y):
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(VOXEL)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * VOXEL, 30))
+        around = o3d.geometry.KDTreeSearchParamHybrid(5 * VOXEL, 100)
+        features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, around))
+        clouds.append(cloud)
+    return clouds, features
+
+
 def ransac_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """FPFH + RANSAC + ICP with the parameters of Open3D's tutorial."""
     import open3d as o3d
 
     pipelines = o3d.pipelines.registration
     o3d.utility.random.seed(0)
-    clouds, features = [], []
-    for points in (x, y):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-        cloud = cloud.voxel_down_sample(VOXEL)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * VOXEL, 30))
-        clouds.append(cloud)
-        around = o3d.geometry.KDTreeSearchParamHybrid(5 * VOXEL, 100)
-        features.append(pipelines.compute_fpfh_feature(cloud, around))
+    clouds, features = described(x, y)
     coarse = pipelines.registration_ransac_based_on_feature_matching(
         *clouds,
         *features,
@@ -104,6 +112,18 @@ def ransac_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         ],
         pipelines.RANSACConvergenceCriteria(100000, 0.999),
     )
+    return open3d_icp(clouds, coarse.transformation)
+
+
+def fgr_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Fast global registration + ICP with the parameters of Open3D's tutorial."""
+    import open3d as o3d
+
+    pipelines = o3d.pipelines.registration
+    o3d.utility.random.seed(0)
+    clouds, features = described(x, y)
+    option = pipelines.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * VOXEL)
+    coarse = pipelines.registration_fgr_based_on_feature_matching(*clouds, *features, option)
     return open3d_icp(clouds, coarse.transformation)
 
 
@@ -123,19 +143,12 @@ def open3d_icp(clouds, initial: np.ndarray) -> np.ndarray:
 def kiss_icp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """KISS-Matcher, then ICP."""
     import kiss_matcher
-    import open3d as o3d
 
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(VOXEL))
     solution = matcher.estimate(x.astype(np.float32), y.astype(np.float32))
     initial = np.eye(4)
     initial[:3, :3], initial[:3, 3] = solution.rotation, np.asarray(solution.translation).ravel()
-    clouds = []
-    for points in (x, y):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-        cloud = cloud.voxel_down_sample(VOXEL)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * VOXEL, 30))
-        clouds.append(cloud)
-    return open3d_icp(clouds, initial)
+    return open3d_icp(described(x, y)[0], initial)
 
 
 def methods(options: Options) -> dict[str, Callable]:
@@ -143,6 +156,7 @@ def methods(options: Options) -> dict[str, Callable]:
     found = {"jaxreg": ours(options.rotation)}
     if importlib.util.find_spec("open3d"):
         found["Open3D FPFH+RANSAC+ICP"] = ransac_icp
+        found["Open3D FGR+ICP"] = fgr_icp
         if importlib.util.find_spec("kiss_matcher"):
             found["KISS-Matcher+ICP"] = kiss_icp
     return {name: method for name, method in found.items() if options.only in name}

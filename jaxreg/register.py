@@ -13,7 +13,7 @@ from jaxreg.config import RegisterConfig
 from jaxreg.dense.register import search_dense
 from jaxreg.refine.host import Refined
 from jaxreg.refine.host import refine as refine_pose
-from jaxreg.refine.tree import index_cloud
+from jaxreg.refine.tree import IndexedCloud, index_cloud
 from jaxreg.refine.uncertainty import weak_directions
 from jaxreg.types import RigidTransform
 
@@ -21,7 +21,6 @@ Rotation = Literal["limited", "full"]
 Refinement = Literal["gicp", "icp", "point_to_plane"]
 
 _DEFAULT = RegisterConfig()
-_NORMAL_NEIGHBORS = 10
 _SMALLEST = 512
 """Smallest size of a padded cloud in the search."""
 _PREFERENCE = 0.01
@@ -100,15 +99,19 @@ def register(
     else:
         pose, rival = scans.pose_in(frame, start), verdict.NO_RIVAL
     refined = _refined(x, y, pose, refine, spacing, config)
-    clouds = (index_cloud(_enough(p), neighbors=_NORMAL_NEIGHBORS) for p in (a, b))
+    clouds = (_indexed(points, config) for points in (a, b))
     reach = config.reach * spacing
     judged = verdict.evidence(refined.transform, *clouds, reach, rival=rival)
     return _result(x, y, moving, fixed, frame, refined, judged, reach, begin)
 
 
-def _enough(points: np.ndarray) -> np.ndarray:
+def _indexed(points: np.ndarray, config: RegisterConfig) -> IndexedCloud:
+    return index_cloud(_enough(points, config), neighbors=config.refine_neighbors)
+
+
+def _enough(points: np.ndarray, config: RegisterConfig) -> np.ndarray:
     """The points, all of them as often as normals need it."""
-    return np.tile(points, (-(-(_NORMAL_NEIGHBORS + 1) // len(points)), 1))
+    return np.tile(points, (-(-(config.refine_neighbors + 1) // len(points)), 1))
 
 
 def _check_options(rotation: str, refine: str | None) -> None:
@@ -180,7 +183,7 @@ def _angles(poses: RigidTransform, rotation: np.ndarray) -> Float[np.ndarray, "p
 
 def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> Refined:
     """The pose refined with more points than the search had."""
-    x, y = (_enough(scans.reduce_to(points, config.refine_points)) for points in (x, y))
+    x, y = (_enough(scans.reduce_to(p, config.refine_points), config) for p in (x, y))
     finer = min(spacing, max(scans.spacing(x), scans.spacing(y)))
     return refine_pose(
         x,
@@ -189,9 +192,10 @@ def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> R
         initial=pose,
         iterations=config.refine_iterations if method else 1,
         max_distance=3 * finer if method else 0.0,
-        anneal=4.0,
+        anneal=config.refine_anneal,
         both_directions=True,
-        neighbors=_NORMAL_NEIGHBORS,
+        neighbors=config.refine_neighbors,
+        thickness=config.refine_thickness,
         dense_limit=0,
     )
 

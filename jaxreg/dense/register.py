@@ -18,6 +18,7 @@ from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
 from jaxreg.dense.verification import evidence, plausibility
 from jaxreg.refine import frame
+from jaxreg.refine.gicp import gicp
 from jaxreg.types import Registration, RigidTransform
 
 _DEFAULT = DenseConfig()
@@ -26,7 +27,7 @@ _RMS_OF_UNIT_SPHERE = 0.5
 
 
 class Search(NamedTuple):
-    """The distinct refined poses (leading axis), best first, in the original frame, and scores."""
+    """The aligned poses (leading axis), best first, in the original frame, and their plausibility."""
 
     poses: RigidTransform
     score: Float[Array, "s"]
@@ -43,7 +44,7 @@ def register_dense(
     """The pose of the source in the frame of the reference, from any start and without learning.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
-    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w the last fine width. The pose
+    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `config.match_width`. The pose
     is differentiable in both clouds through the last refinement alone: the search is discrete.
 
     Raises:
@@ -52,9 +53,20 @@ def register_dense(
     where, x, y = _enter(source, reference, source_mask, reference_mask, config)
     found = _search(x, y, source_mask, reference_mask, config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
-    a, b = _surface(x, source_mask, config)[0], _surface(y, reference_mask, config)[0]
-    pose = align_fine(start, a, b, config.final_widths, thickness=config.thickness)
-    return _registration(where, pose, a, b, config)
+    pose = gicp(
+        x,
+        y,
+        initial=start,
+        source_mask=source_mask,
+        reference_mask=reference_mask,
+        iterations=config.final_iterations,
+        max_distance=config.final_reach,
+        anneal=config.final_anneal,
+        both_directions=True,
+        neighbors=min(config.final_neighbors, min(len(x), len(y)) - 1),
+        thickness=config.thickness,
+    )
+    return _registration(where, pose, x, y, source_mask, reference_mask, config)
 
 
 def search_dense(
@@ -67,7 +79,7 @@ def search_dense(
     largest_angle: Float[Array, ""] | float = math.pi,
     config: DenseConfig = _DEFAULT,
 ) -> Search:
-    """The finalists of the search before the last refinement; errors as `register_dense`.
+    """The poses of the search before the last refinement; errors as `register_dense`.
 
     `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
     (radians) are not.
@@ -86,43 +98,56 @@ def _enter(source, reference, source_mask, reference_mask, config: DenseConfig):
     return where, x * factor, y * factor
 
 
-def _surface(points: Array, mask: Array | None, config: DenseConfig):
-    """The cloud with its normals and rim, and its features."""
-    valid = jnp.ones(points.shape[0], bool) if mask is None else mask
-    described = moment_descriptors(
-        points, valid, radii=config.radii, normal_radius=config.normal_radius
+def _surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
+    """Both clouds with normals, rims and local features, and the cosines of all their features."""
+    masks = [
+        jnp.ones(points.shape[0], bool) if mask is None else mask
+        for points, mask in ((x, source_mask), (y, reference_mask))
+    ]
+    described = [
+        moment_descriptors(points, mask, radii=config.radii, normal_radius=config.normal_radius)
+        for points, mask in zip((x, y), masks, strict=True)
+    ]
+    features = [cloud.features for cloud in described]
+    local = standardized(*(f[:, : f.shape[1] // len(config.radii)] for f in features), *masks)
+    source, reference = (
+        Surface(
+            points,
+            cloud.normals,
+            openness(points, cloud.normals, mask, radius=config.rim_radius),
+            nearby,
+            mask,
+        )
+        for points, cloud, nearby, mask in zip((x, y), described, local, masks, strict=True)
     )
-    rim = openness(points, described.normals, valid, radius=config.rim_radius)
-    return Surface(points, described.normals, rim, valid), described.features
+    one, other = standardized(*features, *masks)
+    return source, reference, jnp.matmul(one, other.T)
 
 
 def _search(
     x, y, source_mask, reference_mask, config: DenseConfig, also=None, largest_angle=math.pi
 ) -> Search:
     x, y = jax.lax.stop_gradient((x, y))
-    source, features = _surface(x, source_mask, config)
-    reference, others = _surface(y, reference_mask, config)
-    features, others = standardized(features, others, source.mask, reference.mask)
-    poses = _hypotheses(source, reference, features @ others.T, config)
+    source, reference, similarity = _surfaces(x, y, source_mask, reference_mask, config)
+    poses = _hypotheses(source, reference, similarity, config)
     grids = [
         nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
         for s in (reference, source)
     ]
     poses = _screened(poses, also, source, reference, grids, largest_angle, config)
+    few, fewer = (thinned(s, config.coarse_step) for s in (source, reference))
     coarse = lambda pose: align_coarse(  # noqa: E731
         pose,
-        thinned(source, config.coarse_step),
+        few,
         reference,
         grids[0],
         config.coarse_widths,
         thickness=config.coarse_thickness,
     )
-    poses = jax.vmap(coarse)(poses)
-    poses = _ranked(poses, source, reference, largest_angle, config).poses
     fine = lambda pose: align_fine(  # noqa: E731
-        pose, source, reference, config.fine_widths, thickness=config.thickness
+        pose, few, fewer, config.fine_widths, thickness=config.thickness
     )
-    poses = jax.lax.map(fine, poses)
+    poses = jax.lax.map(fine, jax.vmap(coarse)(poses))
     return _ranked(poses, source, reference, largest_angle, config)
 
 
@@ -186,7 +211,7 @@ def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]
 def _ranked(
     poses, source: Surface, reference: Surface, largest_angle, config: DenseConfig
 ) -> Search:
-    """The most plausible poses, best first, and their plausibility."""
+    """The poses, the most plausible first, and their plausibility."""
     found = jax.lax.map(
         lambda pose: evidence(
             pose,
@@ -198,22 +223,28 @@ def _ranked(
         ),
         poses,
     )
-    score = plausibility(found, contradiction=config.contradiction, beside=config.beside)
+    score = plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
     # Alignment may have turned a pose out of the bounds of the search.
     score = jnp.where(_turns_less(poses, largest_angle), score, score - 10)
-    score, order = jax.lax.top_k(score, min(config.finalists, len(score)))
+    score, order = jax.lax.top_k(score, len(score))
     return Search(best_of(poses, order), score)
 
 
-def _registration(where, pose, a: Surface, b: Surface, config: DenseConfig) -> Registration:
-    valid = jnp.any(a.mask) & jnp.any(b.mask)
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(a.points.dtype))
-    moved = rigid.apply(pose, a.points)
-    nearest = nearest_packed(moved, b.points, b.mask)
-    squared = jnp.sum((moved - b.points[nearest]) ** 2, axis=-1)
-    trust = jnp.exp(-squared / (2 * config.final_widths[-1] ** 2))
-    trust = jnp.where(a.mask & valid, trust, 0)
+def _registration(
+    where, pose, x, y, source_mask, reference_mask, config: DenseConfig
+) -> Registration:
+    source_mask, reference_mask = (
+        jnp.ones(points.shape[0], bool) if mask is None else mask
+        for points, mask in ((x, source_mask), (y, reference_mask))
+    )
+    valid = jnp.any(source_mask) & jnp.any(reference_mask)
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
+    moved = rigid.apply(pose, x)
+    nearest = nearest_packed(moved, y, reference_mask)
+    squared = jnp.sum((moved - y[nearest]) ** 2, axis=-1)
+    trust = jnp.exp(-squared / (2 * config.match_width**2))
+    trust = jnp.where(source_mask & valid, trust, 0)
     pose = frame.transform_out(where, pose)
-    correspondences = b.points[nearest] * where.length + where.reference_centre
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(a.points.dtype))
+    correspondences = y[nearest] * where.length + where.reference_centre
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
     return Registration(*pose, rigid.to_matrix(pose), trust, correspondences, valid)

@@ -8,12 +8,14 @@ from jaxtyping import Array, Bool, Float
 class Surface(NamedTuple):
     """Points of a surface with unit normals of arbitrary sign; rows with `mask` False are padding.
 
-    `openness` is near 0 inside the sampled surface and large on its rim.
+    `openness` is near 0 inside the sampled surface and large on its rim. `local` are features of
+    length 1 that say what the surface looks like nearby.
     """
 
     points: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
     openness: Float[Array, "n"]
+    local: Float[Array, "n d"]
     mask: Bool[Array, "n"]
 
 

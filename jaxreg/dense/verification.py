@@ -20,14 +20,16 @@ from jaxreg.types import RigidTransform
 
 
 class Evidence(NamedTuple):
-    """Sums over both directions of shares in [0, 1]: each of these is between 0 and 2.
+    """Sums over both directions of means over the points: each of these is between 0 and 2.
 
-    `near`: points close to the other surface. `match`: of these, those on its plane and facing its
-    way. `beside`: points a little off the other surface where that is not open.
+    `match`: close to the other surface, on its plane and facing its way. `alike`: close to a point
+    around which the surface looks alike (may be negative). `within`: close, both points away from
+    any rim. `beside`: a little off the other surface where that has no rim.
     """
 
-    near: Float[Array, ""]
     match: Float[Array, ""]
+    alike: Float[Array, ""]
+    within: Float[Array, ""]
     beside: Float[Array, ""]
 
 
@@ -42,10 +44,11 @@ def evidence(
 ) -> Evidence:
     """The evidence for and against a pose.
 
-    With d the distance to the nearest point of the other cloud, h its part along the normal there
-    and c the cosine of the two normals: ``near = E[exp(-d^2 / 2 width^2)]``, ``match`` the same
-    times ``exp(-h^2 / 2 plane_width^2) c^2``, ``beside = E[max(0, 1 - openness / rim)]`` over the
-    points with d between 2 and 6 `width` (0 for the others).
+    With d the distance to the nearest point of the other cloud, h its part along the normal there,
+    c the cosine of the two normals, s that of the local features, ``k = exp(-d^2 / 2 width^2)`` and
+    ``i = max(0, 1 - openness / rim)`` of the point (i) and of the other (i'): ``match =
+    E[k exp(-h^2 / 2 plane_width^2) c^2]``, ``alike = E[k s]``, ``within = E[k i i']``, ``beside =
+    E[i']`` over the points with d between 1.5 and 3 `width` (0 for the others).
     """
     moved = source._replace(
         points=rigid.apply(pose, source.points),
@@ -56,15 +59,17 @@ def evidence(
     return Evidence(*(a + b for a, b in zip(there, back, strict=True)))
 
 
-def plausibility(evidence: Evidence, *, contradiction: float, beside: float) -> Float[Array, "..."]:
-    """``match - contradiction (near - match) - beside * beside``: the larger, the more plausible."""
-    against = contradiction * (evidence.near - evidence.match) + beside * evidence.beside
-    return evidence.match - against
+def plausibility(
+    evidence: Evidence, *, alike: float, within: float, beside: float
+) -> Float[Array, "..."]:
+    """``match + alike * alike - within * within - beside * beside``: the larger, the better."""
+    against = within * evidence.within + beside * evidence.beside
+    return evidence.match + alike * evidence.alike - against
 
 
 def _one_way(
     moved: Surface, other: Surface, width: float, plane_width: float, rim: float
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     nearest = nearest_packed(moved.points, other.points, other.mask)
     residual = moved.points - other.points[nearest]
     normal = other.normals[nearest]
@@ -73,10 +78,14 @@ def _one_way(
     facing = jnp.sum(moved.normals * normal, axis=-1) ** 2
     close = jnp.exp(-squared / (2 * width**2))
     match = close * jnp.exp(-(height**2) / (2 * plane_width**2)) * facing
-    off = (squared > (2 * width) ** 2) & (squared < (6 * width) ** 2)
-    inside = jnp.where(off, jnp.maximum(0, 1 - other.openness[nearest] / rim), 0)
-    count = jnp.maximum(jnp.sum(moved.mask), 1).astype(close.dtype)
-    close, match, inside = (
-        jnp.sum(jnp.where(moved.mask, value, 0)) / count for value in (close, match, inside)
+    alike = close * jnp.sum(moved.local * other.local[nearest], axis=-1)
+    inside, others_inside = (
+        jnp.maximum(0, 1 - openness / rim) for openness in (moved.openness, other.openness[nearest])
     )
-    return close, match, inside
+    off = (squared > (1.5 * width) ** 2) & (squared < (3 * width) ** 2)
+    beside = jnp.where(off, others_inside, 0)
+    count = jnp.maximum(jnp.sum(moved.mask), 1).astype(close.dtype)
+    return tuple(
+        jnp.sum(jnp.where(moved.mask, value, 0)) / count
+        for value in (match, alike, close * inside * others_inside, beside)
+    )

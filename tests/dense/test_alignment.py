@@ -30,7 +30,8 @@ def pair(seed, n=300, m=400):
     start = Rotation.from_rotvec(np.radians(8) * axis / np.linalg.norm(axis)) * turn
 
     def make(p, n):
-        return Surface(*map(jnp.asarray, (p, n)), jnp.zeros(len(p)), jnp.ones(len(p), bool))
+        flat = jnp.zeros(len(p)), jnp.zeros((len(p), 1))
+        return Surface(*map(jnp.asarray, (p, n)), *flat, jnp.ones(len(p), bool))
 
     pose = RigidTransform(jnp.asarray(start.as_matrix()), jnp.full(3, 0.52))
     return make(*source), make(*moved), turn, pose
@@ -53,6 +54,7 @@ def test_padding_changes_nothing_and_no_pair_keeps_the_pose(seed):
         jnp.concatenate([s.points, jnp.zeros((9, 3))]),
         jnp.concatenate([s.normals, jnp.zeros((9, 3))]),
         jnp.zeros(len(s.mask) + 9),
+        jnp.zeros((len(s.mask) + 9, 1)),
         jnp.arange(len(s.mask) + 9) < len(s.mask),
     )
     alone = align_fine(start, source, reference, WIDTHS, thickness=0.01)

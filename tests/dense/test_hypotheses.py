@@ -24,7 +24,8 @@ def test_right_candidates_give_the_pose_among_wrong_ones(seed):
 def sphere(rng, n):
     points = rng.normal(size=(n, 3))
     points = points / np.linalg.norm(points, axis=1, keepdims=True)
-    return Surface(jnp.asarray(points), jnp.asarray(points), jnp.zeros(n), jnp.arange(n) < n - 5)
+    points = jnp.asarray(points)
+    return Surface(points, points, jnp.zeros(n), jnp.zeros((n, 1)), jnp.arange(n) < n - 5)
 
 
 def test_screening_prefers_the_pose_that_overlays_the_surfaces(seed):

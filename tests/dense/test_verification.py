@@ -1,17 +1,19 @@
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
 from jaxreg.dense.surface import Surface
 from jaxreg.dense.verification import Evidence, evidence, plausibility
+from jaxreg.types import RigidTransform
 
 
-def plane(shift, openness=0.0, n=21):
+def plane(shift, openness=0.0, n=21, local=(1.0, 0.0)):
     line = np.linspace(-1, 1, n)
     points = np.stack([*np.meshgrid(line, line), np.full((n, n), shift)], axis=-1).reshape(-1, 3)
     normals = np.tile([0.0, 0.0, 1.0], (n * n, 1))
-    open_ = np.full(n * n, openness)
-    return Surface(*map(jnp.asarray, (points, normals, open_)), jnp.ones(n * n, bool))
+    open_, local = np.full(n * n, openness), np.tile(local, (n * n, 1))
+    return Surface(*map(jnp.asarray, (points, normals, open_, local)), jnp.ones(n * n, bool))
 
 
 WIDTHS = {"width": 0.05, "plane_width": 0.02, "rim": 0.25}
@@ -20,21 +22,31 @@ WIDTHS = {"width": 0.05, "plane_width": 0.02, "rim": 0.25}
 def test_a_shifted_plane_by_its_equations():
     identity = rigid.identity(jnp.float64)
     for shift in (0.0, 0.01, 0.04):
-        found = evidence(identity, plane(0.0), plane(shift), **WIDTHS)
-        near = np.exp(-(shift**2) / (2 * 0.05**2))
-        np.testing.assert_allclose(found.near, 2 * near, rtol=1e-6)
-        expected = 2 * near * np.exp(-(shift**2) / (2 * 0.02**2))
+        near = 2 * np.exp(-(shift**2) / (2 * 0.05**2))
+        found = evidence(identity, plane(0.0, 0.1), plane(shift, 0.2, local=(0.6, 0.8)), **WIDTHS)
+        expected = near * np.exp(-(shift**2) / (2 * 0.02**2))
         np.testing.assert_allclose(found.match, expected, rtol=1e-6)
+        np.testing.assert_allclose(found.alike, 0.6 * near, rtol=1e-6)
+        np.testing.assert_allclose(found.within, (1 - 0.4) * (1 - 0.8) * near, rtol=1e-6)
         assert found.beside == 0
+
+
+def test_a_plane_that_faces_another_way_does_not_match():
+    turn = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    tilted = plane(0.0)
+    tilted = tilted._replace(normals=jnp.tile(jnp.asarray([0.6, 0.0, 0.8]), (441, 1)))
+    pose = RigidTransform(jnp.asarray(turn), jnp.zeros(3))
+    np.testing.assert_allclose(evidence(pose, tilted, plane(0.0), **WIDTHS).match, 2 * 0.64)
+    np.testing.assert_allclose(evidence(pose, tilted, tilted, **WIDTHS).match, 2 * 0.64**2)
 
 
 def test_beside_the_inside_speaks_against_and_beside_a_rim_does_not():
     identity = rigid.identity(jnp.float64)
-    np.testing.assert_allclose(
-        evidence(identity, plane(0.0), plane(0.2), **WIDTHS).beside, 2, rtol=1e-6
-    )
-    assert evidence(identity, plane(0.0, 0.4), plane(0.2, 0.4), **WIDTHS).beside == 0
-    assert evidence(identity, plane(0.0), plane(0.4), **WIDTHS).beside == 0
+    found = evidence(identity, plane(0.0), plane(0.1, 0.1), **WIDTHS)
+    np.testing.assert_allclose(found.beside, 1 + 0.6, rtol=1e-6)
+    assert evidence(identity, plane(0.0, 0.4), plane(0.1, 0.4), **WIDTHS).beside == 0
+    for shift in (0.07, 0.16):
+        assert evidence(identity, plane(0.0), plane(shift), **WIDTHS).beside == 0
 
 
 def test_padding_counts_for_nothing():
@@ -50,5 +62,6 @@ def test_padding_counts_for_nothing():
 
 
 def test_plausibility_is_linear_in_the_evidence():
-    found = Evidence(jnp.asarray(1.5), jnp.asarray(1.1), jnp.asarray(0.2))
-    np.testing.assert_allclose(plausibility(found, contradiction=0.5, beside=2.0), 1.1 - 0.2 - 0.4)
+    found = Evidence(*(jnp.asarray(x) for x in (1.5, 0.6, 0.3, 0.1)))
+    score = plausibility(found, alike=0.5, within=2.0, beside=4.0)
+    np.testing.assert_allclose(score, 1.5 + 0.3 - 0.6 - 0.4)
