@@ -279,6 +279,8 @@ class DenseConfig:
     """Width of the distance at which points count as near, in the ranking."""
     plane_width: float = 0.02
     """Width of the distance from the other surface's plane at which they match."""
+    dense_spacing: float = 0.035
+    """Mean distance to the nearest point above which both of these widths grow in proportion."""
     rim_radius: float = 0.3
     """Radius at which a surface is seen to be open."""
     rim: float = 0.25

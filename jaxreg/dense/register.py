@@ -17,6 +17,8 @@ from jaxreg.dense.moments import moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
 from jaxreg.dense.verification import evidence, plausibility
+from jaxreg.neighbors import squared_distances
+from jaxreg.numerics import safe_sqrt
 from jaxreg.refine import frame
 from jaxreg.refine.gicp import gicp
 from jaxreg.types import Registration, RigidTransform
@@ -212,13 +214,16 @@ def _ranked(
     poses, source: Surface, reference: Surface, largest_angle, config: DenseConfig
 ) -> Search:
     """The poses, the most plausible first, and their plausibility."""
+    # Points of sparse clouds are beside each other although their surfaces match.
+    sparse = jnp.maximum(_spacing(source), _spacing(reference)) / config.dense_spacing
+    widening = jnp.maximum(sparse, 1)
     found = jax.lax.map(
         lambda pose: evidence(
             pose,
             source,
             reference,
-            width=config.match_width,
-            plane_width=config.plane_width,
+            width=config.match_width * widening,
+            plane_width=config.plane_width * widening,
             rim=config.rim,
         ),
         poses,
@@ -228,6 +233,15 @@ def _ranked(
     score = jnp.where(_turns_less(poses, largest_angle), score, score - 10)
     score, order = jax.lax.top_k(score, len(score))
     return Search(best_of(poses, order), score)
+
+
+def _spacing(surface: Surface) -> Float[Array, ""]:
+    """Mean distance from a point to the nearest other one."""
+    squared = squared_distances(surface.points, surface.points)
+    other = surface.mask[None, :] & ~jnp.eye(len(surface.mask), dtype=bool)
+    nearest = safe_sqrt(jnp.min(jnp.where(other, squared, 4), axis=1))
+    count = jnp.maximum(jnp.sum(surface.mask), 1).astype(squared.dtype)
+    return jnp.sum(jnp.where(surface.mask, nearest, 0)) / count
 
 
 def _registration(

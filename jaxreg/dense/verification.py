@@ -38,8 +38,8 @@ def evidence(
     source: Surface,
     reference: Surface,
     *,
-    width: float,
-    plane_width: float,
+    width: Float[Array, ""] | float,
+    plane_width: Float[Array, ""] | float,
     rim: float,
 ) -> Evidence:
     """The evidence for and against a pose.
@@ -68,7 +68,11 @@ def plausibility(
 
 
 def _one_way(
-    moved: Surface, other: Surface, width: float, plane_width: float, rim: float
+    moved: Surface,
+    other: Surface,
+    width: Float[Array, ""] | float,
+    plane_width: Float[Array, ""] | float,
+    rim: float,
 ) -> tuple[Array, Array, Array, Array]:
     nearest = nearest_packed(moved.points, other.points, other.mask)
     residual = moved.points - other.points[nearest]
