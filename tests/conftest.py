@@ -60,6 +60,9 @@ settings.register_profile(
 settings.load_profile("quick")
 
 
+_MOST_REGIONS = 20_000
+
+
 def pytest_addoption(parser):
     parser.addoption("--seed", default="", help="seed of the random tests: a number, or 'random'")
 
@@ -103,6 +106,19 @@ def _modelnet() -> list[Path]:
 
 def _peers() -> Path:
     return Path(os.environ.get("JAXREG_DATA", "data")).resolve().parent / "peers"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_compiled_programs():
+    """Forgets compiled programs before they are too many.
+
+    Linux allows a process 65,530 mapped regions, every program takes several, and where no more are
+    to be had the compiler crashes.
+    """
+    yield
+    regions = Path("/proc/self/maps")
+    if regions.exists() and regions.read_text().count("\n") > _MOST_REGIONS:
+        jax.clear_caches()
 
 
 @pytest.fixture

@@ -67,6 +67,7 @@ def test_registration_is_that_of_the_equations(rng):
     assert_close(*results, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_loss_is_that_of_the_equations(rng):
     config = Config(model=SMALL)
     variables = variables_of(SMALL)
