@@ -122,6 +122,9 @@ def train_step(
     return TrainState(state.step + 1, variables, average, optimizer), logged
 
 
+_train_step_jit = jit(train_step, static_argnames="config", donate_argnums=0)
+
+
 def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[str, float]:
     """Errors on the first `validation_pairs` pairs of the held-out shapes; the same every time.
 
@@ -170,7 +173,6 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
         points=shape_points(config.test_pairs),
         seed=config.train.seed,
     )
-    step = jit(functools.partial(train_step, config=config), donate_argnums=0)
     on_device = jnp.asarray(shapes)
     with (
         checkpoint.open_run(workdir, config) as run,
@@ -178,7 +180,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     ):
         state = run.restore(create_train_state(config))
         while int(state.step) < config.train.steps:
-            state, logged = step(state, on_device)
+            state, logged = _train_step_jit(state, on_device, config=config)
             number = int(state.step)
             entry = {"step": number} | {name: float(value) for name, value in logged.items()}
             if not np.isfinite([entry["loss"], entry["gradient_norm"]]).all():

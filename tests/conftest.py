@@ -60,7 +60,7 @@ settings.register_profile(
 settings.load_profile("quick")
 
 
-_MOST_REGIONS = 20_000
+_MOST_REGIONS = 40_000
 
 
 def pytest_addoption(parser):

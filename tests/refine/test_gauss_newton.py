@@ -28,7 +28,7 @@ def test_rotation_equals_scipy(size, seed):
 
 
 def test_rotation_derivative_at_zero_is_the_skew_matrix():
-    jacobian = jax.jacobian(rotation_from_vector)(jnp.zeros(3))
+    jacobian = jax.jit(jax.jacobian(rotation_from_vector))(jnp.zeros(3))
     for i in range(3):
         np.testing.assert_allclose(jacobian[..., i], skew(jnp.eye(3)[i]), atol=1e-15)
 
@@ -73,14 +73,14 @@ def test_solution_is_that_of_the_system(seed):
     h = root @ root.T + 10 * np.eye(6)
     expected = np.linalg.solve(h, g)
     np.testing.assert_allclose(
-        solve_damped(jnp.asarray(h), jnp.asarray(g)), expected, rtol=1e-3, atol=1e-5
+        jax.jit(solve_damped)(jnp.asarray(h), jnp.asarray(g)), expected, rtol=1e-3, atol=1e-5
     )
 
 
 def test_nothing_to_solve_is_no_step():
     zero = jnp.zeros((6, 6)), jnp.zeros(6)
     np.testing.assert_array_equal(solve_damped(*zero), np.zeros(6))
-    assert all(np.isfinite(j).all() for j in jax.jacobian(solve_damped, (0, 1))(*zero))
+    assert all(np.isfinite(j).all() for j in jax.jit(jax.jacobian(solve_damped, (0, 1)))(*zero))
 
 
 def test_small_motion_is_found_in_one_step(seed):
@@ -99,6 +99,7 @@ def test_step_is_bounded_and_differentiable(seed):
     pose = RigidTransform(rotation_from_vector(p[0]), q[0])
     metric = jnp.tile(jnp.eye(3), (12, 1, 1))
 
+    @jax.jit
     def step(p, q, metric):
         return gauss_newton_step(pose, jnp.asarray(p), jnp.asarray(q), jnp.asarray(metric))
 

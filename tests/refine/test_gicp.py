@@ -1,6 +1,5 @@
 """Generalised ICP against a general minimiser, small_gicp and Open3D."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,9 +7,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from jaxreg.refine.gicp import gicp
-from jaxreg.refine.icp import icp
-from jaxreg.refine.point_to_plane import point_to_plane
+from tests.compiled import gicp, icp, point_to_plane
 
 
 def make_pair(seed, n=600, noise=0.002):
@@ -86,9 +83,7 @@ def test_agrees_with_small_gicp(number, seed):
         max_correspondence_distance=10.0, max_iterations=200,
         rotation_epsilon=1e-8, translation_epsilon=1e-8,
     )  # fmt: skip
-    pose = jax.jit(lambda x, y: gicp(x, y, kernel="none", iterations=60))(
-        jnp.asarray(source), jnp.asarray(reference)
-    )
+    pose = gicp(jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=60)
     assert_agree(pose, theirs.T_target_source, extent=2.0)
 
 
@@ -112,7 +107,5 @@ def test_agrees_with_open3d(method, seed):
         *clouds, 10.0, np.eye(4), estimation,
         registration.ICPConvergenceCriteria(1e-12, 1e-12, 300),
     )  # fmt: skip
-    pose = jax.jit(lambda x, y: solve(x, y, kernel="none", iterations=150))(
-        jnp.asarray(source), jnp.asarray(reference)
-    )
+    pose = solve(jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=150)
     assert_agree(pose, theirs.transformation, extent=2.0)

@@ -6,10 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.refine import tree
-from jaxreg.refine.gicp import gicp
 from jaxreg.refine.host import refine
 from jaxreg.refine.uncertainty import pose_uncertainty
 from jaxreg.types import RigidTransform
+from tests.compiled import gicp
 
 METHODS = ["icp", "point_to_plane", "gicp"]
 

@@ -9,13 +9,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
-from jaxreg.refine import icp as room
 from jaxreg.refine.frame import check_clouds
 from jaxreg.types import RigidTransform
-
-icp = jax.jit(
-    room.icp, static_argnames=("iterations", "kernel", "trim", "anneal", "both_directions")
-)
+from tests.compiled import icp
 
 
 def make_pair(seed, n=80, m=None, angle_deg=8.0, noise=0.0):
@@ -158,7 +154,7 @@ def test_derivatives_equal_finite_differences(kernel):
     source, reference, _ = make_pair(10, n=30, m=40, noise=0.05)
     options = {"iterations": 4, "kernel": kernel, "trim": 0.9}
     check_grads(
-        lambda x, y: pose_sum(jnp.asarray(x), jnp.asarray(y), options),
+        jax.jit(lambda x, y: pose_sum(jnp.asarray(x), jnp.asarray(y), options)),
         (jnp.asarray(source), jnp.asarray(reference)),
         order=1,
         modes=("fwd", "rev"),
@@ -201,7 +197,8 @@ def test_no_overlap_keeps_the_initial_pose(kernel):
     result = icp(jnp.asarray(source), far, **options)
     np.testing.assert_allclose(result.rotation, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(result.translation, 0, atol=1e-12)
-    gradients = jax.grad(pose_sum, (0, 1))(jnp.asarray(source), far, options)
+    differentiate = jax.jit(jax.grad(lambda x, y: pose_sum(x, y, options), (0, 1)))
+    gradients = differentiate(jnp.asarray(source), far)
     assert all(np.isfinite(g).all() for g in gradients)
 
 
@@ -214,10 +211,13 @@ def test_padding_changes_nothing(both_directions):
     padded_y = jnp.concatenate([jnp.full((9, 3), jnp.nan), y])
     masks = {"source_mask": jnp.arange(len(padded_x)) < len(x),
              "reference_mask": jnp.arange(len(padded_y)) >= 9}  # fmt: skip
-    value, gradient = jax.value_and_grad(pose_sum, (0, 1))(x, y, options)
-    padded, padded_gradient = jax.value_and_grad(pose_sum, (0, 1))(
-        padded_x, padded_y, options, **masks
-    )
+
+    @jax.jit
+    def differentiate(x, y, masks):
+        return jax.value_and_grad(lambda x, y: pose_sum(x, y, options, **masks), (0, 1))(x, y)
+
+    value, gradient = differentiate(x, y, {})
+    padded, padded_gradient = differentiate(padded_x, padded_y, masks)
     np.testing.assert_allclose(padded, value, rtol=1e-9)
     np.testing.assert_allclose(padded_gradient[0][: len(x)], gradient[0], atol=1e-9)
     np.testing.assert_allclose(padded_gradient[1][9:], gradient[1], atol=1e-9)

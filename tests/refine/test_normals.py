@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxreg.neighbors import knn
 from jaxreg.refine.normals import (
     inverse_symmetric,
-    neighborhood_covariances,
-    normals,
     plane_covariances,
     smallest_eigenvector,
 )
+from tests.compiled import knn, neighborhood_covariances, normals
 
 
 def surface(seed, n=60):

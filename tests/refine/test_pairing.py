@@ -9,12 +9,12 @@ from scipy.spatial import cKDTree
 from jaxreg.refine.pairing import (
     Weighting,
     check_options,
-    closest_pairs,
     kernel_weight,
     masked_quantile,
     pair_weights,
     widenings,
 )
+from tests.compiled import closest_pairs
 
 
 def test_pairs_equal_the_tree(seed):

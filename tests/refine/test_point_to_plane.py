@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from jaxreg.refine.point_to_plane import point_to_plane
+from tests.compiled import point_to_plane
 
 
 def surface(rng, n):

@@ -1,0 +1,28 @@
+"""Functions of the library as one program each, for tests that call them plainly.
+
+Eager, a call is hundreds of little programs, each traced, lowered and compiled by itself, which took a
+third of the time of the suite. That jit equals eager is a test of its own (tests/transforms).
+"""
+
+import jax
+
+from jaxreg import neighbors
+from jaxreg.dense import moments
+from jaxreg.refine import gicp as _gicp
+from jaxreg.refine import icp as _icp
+from jaxreg.refine import normals as _normals
+from jaxreg.refine import pairing
+from jaxreg.refine import point_to_plane as _point_to_plane
+
+_SOLVER = ("iterations", "kernel", "trim", "anneal", "both_directions")
+
+knn = jax.jit(neighbors.knn, static_argnums=1)
+closest_pairs = jax.jit(pairing.closest_pairs, static_argnames="both_directions")
+normals = jax.jit(_normals.normals)
+neighborhood_covariances = jax.jit(_normals.neighborhood_covariances)
+icp = jax.jit(_icp.icp, static_argnames=_SOLVER)
+point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames=(*_SOLVER, "neighbors"))
+gicp = jax.jit(_gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness"))
+moment_descriptors = jax.jit(moments.moment_descriptors, static_argnames=("radii", "normal_radius"))
+standardized = jax.jit(moments.standardized)
+openness = jax.jit(moments.openness, static_argnames="radius")
