@@ -15,7 +15,7 @@ demo: $(VENV)/.installed  ## train on procedural shapes, evaluate, draw a pair (
 	$(BIN)/python evaluate.py configs/synthetic_cpu.toml --checkpoint runs/demo --picture runs/demo/pair.png
 
 test: $(VENV)/.installed-dev  ## run the tests and report the coverage (12 minutes, 2 cores)
-	$(BIN)/python -m pytest -n 2 -m "not slow" --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" --cov --cov-report=term
 
 slow: $(VENV)/.installed-dev  ## run the tests that `make test` leaves out
 	$(BIN)/python -m pytest -m slow

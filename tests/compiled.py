@@ -14,6 +14,11 @@ from jaxreg.refine import normals as _normals
 from jaxreg.refine import pairing
 from jaxreg.refine import point_to_plane as _point_to_plane
 
+AS_USERS = {"xla_backend_optimization_level": 3}
+"""Options with which XLA compiles as in a user's process, not as tests/conftest.py has it."""
+if jax.__version_info__ < (0, 11):
+    AS_USERS["xla_cpu_use_fusion_emitters"] = True
+
 _SOLVER = ("iterations", "kernel", "trim", "anneal", "both_directions")
 
 knn = jax.jit(neighbors.knn, static_argnums=1)

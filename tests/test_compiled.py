@@ -19,6 +19,7 @@ from jaxreg import inliers, matching, neighbors, scans, training
 from jaxreg.compilation import jit
 from jaxreg.config import from_dict
 from jaxreg.model import init_variables, register_pair
+from tests.compiled import AS_USERS
 
 # Sizes that tell the arrays apart: N x M x K exceeds whatever the networks or a stack over the
 # iterations hold, and the number of iterations is the trip count of no other loop.
@@ -48,7 +49,7 @@ pytestmark = [
 
 def compiled(function, *inputs) -> str:
     """The text of the compiled program; `function` is jitted."""
-    return function.lower(*inputs).compile().as_text()
+    return function.lower(*inputs).compile(AS_USERS).as_text()
 
 
 def array(*shape, dtype=jnp.float32):

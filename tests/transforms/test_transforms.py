@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import jaxreg
+from tests.compiled import AS_USERS
 from tests.transforms.core_rows import core_rows
 from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.refine_rows import refine_rows
@@ -234,8 +235,7 @@ def test_derivatives_hold_in_optimised_kernels_too(name, row, seed):
         _, pull = jax.vjp(lambda x: function(x, leaves), values)
         return outputs, tangent, pull([jnp.ones_like(x) for x in outputs])[0]
 
-    optimised = {"xla_backend_optimization_level": 3}
-    outputs, tangent, gradient = jax.jit(both, compiler_options=optimised)(values, direction)
+    outputs, tangent, gradient = jax.jit(both, compiler_options=AS_USERS)(values, direction)
     forward = sum(np.sum(t) for t in tangent)
     reverse = sum(np.sum(d * g) for d, g in zip(direction, gradient, strict=True))
     assert all(np.isfinite(x).all() for x in outputs)
