@@ -65,18 +65,21 @@ def neighborhoods(points, k):
 def batch_norm(params, statistics, x, train):
     """Normalise channels: by running statistics, or by those of the batch (`vmap` axis "batch")."""
     params, statistics = params["BatchNorm_0"], statistics["BatchNorm_0"]
-    mean, variance = statistics["mean"], statistics["var"]
+    axes = tuple(range(x.ndim - 1))
+    mean, variance, scale, bias = (
+        jnp.expand_dims(value, axes)
+        for value in (statistics["mean"], statistics["var"], params["scale"], params["bias"])
+    )
     if train:
-        axes = tuple(range(x.ndim - 1))
-        mean = jax.lax.pmean(jnp.mean(x, axis=axes), "batch")
-        variance = jax.lax.pmean(jnp.mean((x - mean) ** 2, axis=axes), "batch")
-    return (x - mean) / jnp.sqrt(variance + 1e-5) * params["scale"] + params["bias"]
+        mean = jax.lax.pmean(jnp.mean(x, axis=axes, keepdims=True), "batch")
+        variance = jax.lax.pmean(jnp.mean((x - mean) ** 2, axis=axes, keepdims=True), "batch")
+    return (x - mean) / jnp.sqrt(variance + 1e-5) * scale + bias
 
 
 def dense(params, x):
     """A linear map of the last axis."""
     y = x @ params["kernel"]
-    return y + params["bias"] if "bias" in params else y
+    return y + jnp.broadcast_to(params["bias"], y.shape) if "bias" in params else y
 
 
 def features(variables, points, neighbors, train):
@@ -149,9 +152,9 @@ def procrustes(source, reference, weights):
     """R, t of Eq. 13 by a singular value decomposition."""
     share = weights / jnp.sum(weights)
     p, q = share @ source, share @ reference
-    u, _, vt = jnp.linalg.svd((share[:, None] * (source - p)).T @ (reference - q))
+    u, _, vt = jnp.linalg.svd((share[:, None] * (source - p[None])).T @ (reference - q[None]))
     sign = jnp.linalg.det(vt.T @ u.T)
-    rotation = (vt.T * jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign])) @ u.T
+    rotation = (vt.T * jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), sign])[None]) @ u.T
     return rotation, q - rotation @ p
 
 
@@ -177,7 +180,7 @@ def register(variables: Any, source, reference, *, config) -> Result:
     rotation, translation = jnp.eye(3, dtype=source.dtype), jnp.zeros(3, source.dtype)
     for _ in range(config.iterations):
         weights, parts = step(variables, source, reference, config, train=False)
-        source = source @ parts.rotation.T + parts.translation
+        source = source @ parts.rotation.T + parts.translation[None]
         rotation = parts.rotation @ rotation
         translation = parts.rotation @ translation + parts.translation
     return Result(rotation, translation, weights, parts.copy)
@@ -185,7 +188,7 @@ def register(variables: Any, source, reference, *, config) -> Result:
 
 def losses(parts, reference, config):
     """L_gc + gamma L_in + rho L_gs + lambda L_sc of one iteration (Eq. 14-17)."""
-    moved = parts.source @ parts.rotation.T + parts.translation
+    moved = parts.source @ parts.rotation.T + parts.translation[None]
     distance = squared_distances(moved, reference)
     nearest = jnp.concatenate([jnp.min(distance, axis=1), jnp.min(distance, axis=0)])
     beta = config.beta
@@ -212,7 +215,7 @@ def batch_loss(params: Any, statistics: Any, sources, references, *, config) -> 
         for _ in range(config.model.iterations):
             _, parts = step(variables, source, reference, config.model, train=True)
             total += losses(parts, reference, config.loss)
-            source = source @ parts.rotation.T + parts.translation
+            source = source @ parts.rotation.T + parts.translation[None]
         return total
 
     return jnp.mean(jax.vmap(pair_loss, axis_name="batch")(sources, references))

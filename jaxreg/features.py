@@ -64,7 +64,9 @@ class _Normalize(nn.Module):
                 batch = batch.astype(running.value.dtype)
                 running.value = self.momentum * running.value + (1 - self.momentum) * batch
         factor = jax.lax.rsqrt(statistics[1] + self.epsilon) * scale
-        return (x - statistics[0]) * factor + bias
+        axes = tuple(range(x.ndim - 1))
+        center, factor, bias = (jnp.expand_dims(v, axes) for v in (statistics[0], factor, bias))
+        return (x - center) * factor + bias
 
 
 def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
@@ -79,7 +81,7 @@ def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
     count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)
     mean = over_batch(x) / count
     # Two passes: E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
-    return mean, over_batch((x - mean) ** 2) / count
+    return mean, over_batch((x - mean[None, :]) ** 2) / count
 
 
 class DGCNN(nn.Module):

@@ -25,7 +25,7 @@ def squared_feature_distance(
 ) -> Float[Array, "n m"]:
     """``D[i, j]^2 = |source[i] - reference[j]|^2`` of features; rounding may leave it below zero."""
     # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as they can be.
-    center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))
+    center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))[None, :]
     a, b = source - center, reference - center
     product = jnp.matmul(a, b.T, precision=Precision.HIGHEST)
     return jnp.sum(a * a, axis=1)[:, None] - 2 * product + jnp.sum(b * b, axis=1)[None, :]

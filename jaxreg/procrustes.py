@@ -41,8 +41,8 @@ def weighted_procrustes(
     source_centroid = jnp.sum(share * source, axis=0)
     reference_centroid = jnp.sum(share * reference, axis=0)
     covariance = jnp.matmul(
-        (share * (source - source_centroid)).T,
-        reference - reference_centroid,
+        (share * (source - source_centroid[None, :])).T,
+        reference - reference_centroid[None, :],
         precision=Precision.HIGHEST,
     )
     rotation = special_procrustes(covariance)
@@ -84,7 +84,7 @@ def geman_mcclure_weights(
 ) -> Float[Array, "n"]:
     """``(s^2 / (s^2 + r_i^2))^2`` with s three times the median residual of positive weights."""
     error = jnp.matmul(source, transform.rotation.T, precision=Precision.HIGHEST)
-    square = jnp.sum((error + transform.translation - reference) ** 2, axis=1)
+    square = jnp.sum((error + transform.translation[None, :] - reference) ** 2, axis=1)
     counts = weights > 0
     ordered = jnp.sort(jnp.where(counts, square, jnp.inf))
     middle = jnp.maximum(jnp.sum(counts, dtype=jnp.int32) - 1, 0) // 2
@@ -108,7 +108,7 @@ def _rotation(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     u, _, vt = jnp.linalg.svd(covariance)
     sign = jnp.linalg.det(jnp.matmul(vt.T, u.T, precision=Precision.HIGHEST))
     signs = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), jnp.sign(sign)])
-    rotation = jnp.matmul(vt.T * signs, u.T, precision=Precision.HIGHEST)
+    rotation = jnp.matmul(vt.T * signs[None, :], u.T, precision=Precision.HIGHEST)
     # One Newton step towards the nearest orthogonal matrix: float32 factors are orthogonal to
     # 1e-6 only, which a chain of iterations would add up.
     gram = jnp.matmul(rotation.T, rotation, precision=Precision.HIGHEST)

@@ -15,7 +15,7 @@ def identity(dtype=None) -> RigidTransform:
 def apply(transform: RigidTransform, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """``R x + t`` for every point ``x``; the unit is that of `points`."""
     rotated = jnp.matmul(points, transform.rotation.T, precision=Precision.HIGHEST)
-    return rotated + transform.translation
+    return rotated + jnp.broadcast_to(transform.translation, rotated.shape)
 
 
 def compose(second: RigidTransform, first: RigidTransform) -> RigidTransform:

@@ -6,9 +6,11 @@ float32, and `@pytest.mark.parametrize("dtype", ["float32", "float64"])` runs bo
 a module, by `pytestmark`) with `pytest.mark.float32` to turn x64 off as in a user's process: for
 networks, training and the command line, where arrays are made without a dtype.
 
-Promotion. Mixing dtypes silently is an error (`jax_numpy_dtype_promotion = "strict"`). optax adds
-Python floats to its int32 counter of steps: tests that run an optimiser or a schedule are marked
-`pytest.mark.loose`. Ranks may be promoted, since `points - centroid` is how the field writes it.
+Promotion. Mixing dtypes silently is an error (`jax_numpy_dtype_promotion = "strict"`), and so is
+mixing ranks (`jax_numpy_rank_promotion = "raise"`): `weights * points` would pass where n happens
+to be 3, so that an axis is added by hand, `points - centroid[None, :]`. optax adds Python floats to
+its int32 counter of steps: tests that run an optimiser or a schedule are marked
+`pytest.mark.loose`, which lets dtypes be promoted. No third party needs ranks to be.
 
 Types. The jaxtyping hook has beartype check every signature of jaxreg: when traced under jit, so
 compiled code is as fast as without it. It sees a wrong shape before the function does; mark a test
@@ -87,6 +89,7 @@ def pytest_runtest_protocol(item):
     jax.config.update("jax_enable_x64", item.get_closest_marker("float32") is None)
     loose = item.get_closest_marker("loose") is not None
     jax.config.update("jax_numpy_dtype_promotion", "standard" if loose else "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
     jaxtyping.config.update("jaxtyping_disable", item.get_closest_marker("untyped") is not None)
     return (yield)
 

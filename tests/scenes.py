@@ -36,7 +36,7 @@ def pose(rng, largest=40.0):
 
 
 def moved(points, rotation, translation):
-    return points @ rotation.T + translation
+    return points @ np.asarray(rotation).T + np.asarray(translation)
 
 
 def angle_deg(a, b) -> float:

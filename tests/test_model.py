@@ -155,6 +155,7 @@ def test_steps_compose_and_move_the_source(rng):
     variables = variables_of(SMALL)
     source, reference = draw_pair(rng)
     transform, step, _ = steps(SMALL)(variables, everything(source), everything(reference))
+    transform, step = jax.tree.map(np.asarray, (transform, step))
     np.testing.assert_allclose(step.source[0], source, atol=1e-15)
     points = source
     for number in range(SMALL.iterations):
@@ -164,7 +165,7 @@ def test_steps_compose_and_move_the_source(rng):
     np.testing.assert_allclose(
         source @ transform.rotation.T + transform.translation, points, atol=1e-12
     )
-    expected = np.argsort(-np.asarray(step.confidence[0]))[: SMALL.n_inliers]
+    expected = np.argsort(-step.confidence[0])[: SMALL.n_inliers]
     np.testing.assert_array_equal(step.inliers[0], expected)
 
 

@@ -313,13 +313,14 @@ def test_robust_procrustes_minimises_the_geman_mcclure_cost_by_scipy(rng):
     # Iterated to its end it is a stationary point of the robust cost at the last width.
     source, reference, weights, *_ = with_wrong_pairs(rng, noise=0.02)
     found = robust_procrustes(source, reference, weights, rounds=40)
-    residual = np.linalg.norm(source @ found.rotation.T + found.translation - reference, axis=1)
+    rotation, translation = map(np.asarray, found)
+    residual = np.linalg.norm(source @ rotation.T + translation - reference, axis=1)
     width = 3 * np.sort(residual)[(len(residual) - 1) // 2]
     forgiving = weights * (width**2 / (width**2 + residual**2)) ** 2
     share = (forgiving / forgiving.sum())[:, None]
     x, y = source - (share * source).sum(axis=0), reference - (share * reference).sum(axis=0)
     expected, _ = Rotation.align_vectors(y, x, weights=forgiving)
-    np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(rotation, expected.as_matrix(), atol=1e-6)
 
 
 def test_without_rounds_or_without_weights_the_robust_solution_is_the_plain_one(rng):

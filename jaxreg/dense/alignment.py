@@ -31,7 +31,7 @@ def align_coarse(
     The metric ``n n^T + thickness I`` is that of point to plane, held where planes would slide.
     """
     outer = reference.normals[:, :, None] * reference.normals[:, None, :]
-    metric = outer + thickness * jnp.eye(3, dtype=outer.dtype)
+    metric = outer + thickness * jnp.eye(3, dtype=outer.dtype)[None]
 
     def step(pose: RigidTransform, width: Array):
         moved = rigid.apply(pose, source.points)

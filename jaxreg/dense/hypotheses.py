@@ -46,7 +46,7 @@ def screen(
     nearest = lookup(grid, moved)
     squared = jnp.sum((moved - reference.points[nearest]) ** 2, axis=-1)
     facing = jnp.sum(normals * reference.normals[nearest], axis=-1) ** 2
-    overlap = jnp.where(source.mask, jnp.exp(-squared / (2 * width**2)) * facing, 0)
+    overlap = jnp.where(source.mask[None, :], jnp.exp(-squared / (2 * width**2)) * facing, 0)
     count = jnp.maximum(jnp.sum(source.mask), 1).astype(overlap.dtype)
     return jnp.sum(overlap, axis=1) / count
 

@@ -45,7 +45,8 @@ def moment_descriptors(
     points = jax.lax.stop_gradient(without_padding(points, mask))
     valid = jnp.ones(points.shape[0], bool) if mask is None else mask
     count = jnp.maximum(jnp.sum(valid), 1).astype(points.dtype)
-    points = without_padding(points - jnp.sum(points, axis=0) / count, valid)
+    centroid = jnp.sum(points, axis=0) / count
+    points = without_padding(points - centroid[None, :], valid)
     squared = squared_distances(points, points)
     normals = _normals(points, squared, valid, normal_radius)
     table = jnp.concatenate([points, _outer(points), _outer(normals)], axis=1)
@@ -67,9 +68,10 @@ def standardized(
     both, valid = jnp.concatenate([source, reference]), jnp.concatenate(masks)[:, None]
     both = jnp.where(valid, both, 0)
     count = jnp.maximum(jnp.sum(valid), 1).astype(both.dtype)
-    centred = jnp.where(valid, both - jnp.sum(both, axis=0) / count, 0)
+    mean = jnp.sum(both, axis=0) / count
+    centred = jnp.where(valid, both - mean[None, :], 0)
     deviation = safe_sqrt(jnp.sum(centred**2, axis=0) / count)
-    centred = centred / jnp.where(deviation > _SMALLEST_NORM, deviation, 1)
+    centred = centred / jnp.where(deviation > _SMALLEST_NORM, deviation, 1)[None, :]
     unit = centred / jnp.maximum(safe_norm(centred), _SMALLEST_NORM)[:, None]
     return unit[: source.shape[0]], unit[source.shape[0] :]
 

@@ -65,5 +65,7 @@ def lookup(grid: NearestGrid, queries: Float[Array, "*q 3"]) -> Int[Array, "*q"]
     A query outside the box takes the nearest cell of the box.
     """
     cells = round(grid.index.shape[0] ** (1 / 3))
-    cell = jnp.clip(((queries - grid.corner) / grid.cell).astype(jnp.int32), 0, cells - 1)
+    axes = tuple(range(queries.ndim - 1))
+    corner, size = (jnp.expand_dims(side, axes) for side in (grid.corner, grid.cell))
+    cell = jnp.clip(((queries - corner) / size).astype(jnp.int32), 0, cells - 1)
     return grid.index[(cell[..., 0] * cells + cell[..., 1]) * cells + cell[..., 2]]

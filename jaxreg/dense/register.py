@@ -259,6 +259,6 @@ def _registration(
     trust = jnp.exp(-squared / (2 * config.match_width**2))
     trust = jnp.where(source_mask & valid, trust, 0)
     pose = frame.transform_out(where, pose)
-    correspondences = y[nearest] * where.length + where.reference_centre
+    correspondences = y[nearest] * where.length + where.reference_centre[None, :]
     pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
     return Registration(*pose, rigid.to_matrix(pose), trust, correspondences, valid)

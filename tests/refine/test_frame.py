@@ -18,7 +18,7 @@ def test_clouds_are_centred_and_of_unit_radius(seed):
     np.testing.assert_allclose(inner_y.mean(0), 0, atol=1e-12)
     squares = (np.square(inner_x).sum(1).mean(), np.square(inner_y).sum(1).mean())
     np.testing.assert_allclose(sum(squares) / 2, 1)
-    np.testing.assert_allclose(inner_x * where.length + where.source_centre, x)
+    np.testing.assert_allclose(inner_x * where.length + where.source_centre[None], x)
 
 
 def test_transform_goes_in_and_out(seed):
