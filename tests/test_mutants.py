@@ -1,0 +1,18 @@
+"""A mutant whose text or test is gone breaks nothing: found here at once, not by `make mutants`."""
+
+import pytest
+
+from tests import mutants
+
+
+@pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda m: f"{m.module}: {m.text}")
+def test_text_stands_once_and_the_test_exists(mutant):
+    module = (mutants.ROOT / "jaxreg" / f"{mutant.module}.py").read_text(encoding="utf-8")
+    assert module.count(mutant.text) == 1
+    path, _, name = mutants.test_of(mutant).partition("::")
+    tests = (mutants.ROOT / path).read_text(encoding="utf-8")
+    assert f"def {name.partition('[')[0]}(" in tests
+
+
+def test_there_are_many():
+    assert len(mutants.MUTANTS) >= 15
