@@ -63,12 +63,25 @@ class Options:
     """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
 
 
+def _check(options: Options) -> None:
+    """What cannot be done is said before the work, not after it."""
+    if options.pairs < 0 or options.batch < 1:
+        raise ValueError(
+            f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
+            "--batch 1 or more."
+        )
+    for path in (options.json, options.picture, options.save_pairs, options.save_transforms):
+        if path and not Path(path).parent.is_dir():
+            raise ValueError(f"{path}: there is no folder {Path(path).parent}: make it first.")
+
+
 def main() -> None:
     """Parse, evaluate, print."""
     path, options = parse(Options, description=__doc__)
     enable_compilation_cache()
     chosen = {name: getattr(options, name) for name in _CHOICE}
     try:
+        _check(options)
         root = data_root(options.data_root, path)
         result = scoring.score(options.config, root=root, **chosen)
         _write_extras(options, root)

@@ -41,6 +41,8 @@ def main() -> None:
         train(options.config, workdir, root=root)
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command goes on from the newest checkpoint")
     plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
     if options.release:
         command = f"python train.py {path} --workdir {workdir}"

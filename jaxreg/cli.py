@@ -1,13 +1,15 @@
 """The command line: register two scans, describe a file, look at clouds.
 
-Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted.
+Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted, 130 interrupted.
 """
 
 import contextlib
 import dataclasses
 import json
+import os
+import re
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +19,7 @@ from rich.console import Console
 
 from jaxreg.config import RegisterConfig
 
-SUCCESS, BAD_INPUT, NOT_TRUSTED = 0, 2, 3
+SUCCESS, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 2, 3, 130
 
 _CACHE_MISS = "/jax/compilation_cache/cache_misses"
 _COMPILING = (
@@ -98,17 +100,20 @@ def main(arguments: list[str] | None = None) -> int:
     run = {Register: register_files, Info: describe_file, View: view_files}[type(command)]
     try:
         return run(command)
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted")
+        return INTERRUPTED
     except ValueError as error:
         message = str(error)
     except OSError as error:
         message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    Console(stderr=True, highlight=False, soft_wrap=True).print(f"error: {message}", markup=False)
+    console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+    console.print(f"error: {message}", markup=False)
     return BAD_INPUT
 
 
 def register_files(command: Register) -> int:
     """`jaxreg register`."""
-    from jaxreg import summary
     from jaxreg.register import register
 
     _check_outputs(command)
@@ -126,6 +131,20 @@ def register_files(command: Register) -> int:
             nonfinite=command.nonfinite,
             config=command.config,
         )
+    try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
+        _write_results(command, source, reference, result)
+    finally:
+        _print_result(command, source, reference, result)
+    for path in _outputs(command):
+        _line("wrote", str(path))
+    if not result.success:
+        _line("hint", _HINT)
+    return SUCCESS if result.success else NOT_TRUSTED
+
+
+def _print_result(command: Register, source, reference, result) -> None:
+    from jaxreg import summary
+
     _line("source", f"{command.source} ({len(source):,} points)")
     _line("reference", f"{command.reference} ({len(reference):,} points)")
     for name, value in summary.figures(result).items():
@@ -133,10 +152,10 @@ def register_files(command: Register) -> int:
     _print("transformation (source to reference)")
     _print(summary.matrix_text(result.transformation))
     _line("verdict", summary.verdict_line(result))
-    _write_results(command, source, reference, result)
-    if not result.success:
-        _line("hint", _HINT)
-    return SUCCESS if result.success else NOT_TRUSTED
+
+
+def _outputs(command: Register) -> list[Path]:
+    return [p for p in (command.output, command.json, command.plot, command.html) if p]
 
 
 def _check_outputs(command: Register) -> None:
@@ -147,13 +166,34 @@ def _check_outputs(command: Register) -> None:
         io.check_writable(command.output)
     if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
-    for path in filter(None, (command.json, command.plot, command.html)):
-        _check_folder(path)
+    taken = [command.source, command.reference, *filter(None, [command.initial])]
+    for path in _outputs(command):
+        _check_place(path, taken)
+        taken.append(path)
 
 
-def _check_folder(path: Path) -> None:
+def _check_place(path: Path, taken: Sequence[Path]) -> None:
+    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory: name a file in it.")
+    if path.resolve() in [other.resolve() for other in taken]:
+        raise ValueError(f"{path} is read or written by this command already: choose another name.")
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A file to write to, which takes the place of `path` once it is complete."""
+    if path.exists() and not path.is_file():  # A device or a pipe is written as it is.
+        yield path
+        return
+    part = path.resolve().with_name(f".{os.getpid()}-{path.name}")
+    try:
+        yield part
+        part.replace(path.resolve())
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _checked(path: Path, nonfinite: str) -> np.ndarray:
@@ -175,22 +215,35 @@ def _checked(path: Path, nonfinite: str) -> np.ndarray:
 def _write_results(command: Register, source, reference, result) -> None:
     from jaxreg import io, summary, viewer
 
-    if command.output:
-        if command.output.suffix.lower() == command.source.suffix.lower() == ".ply":
-            io.ply.write_moved(command.output, command.source, result.rotation, result.translation)
+    def write_output(path: Path) -> None:
+        if path.suffix.lower() == command.source.suffix.lower() == ".ply":
+            io.ply.write_moved(path, command.source, result.rotation, result.translation)
         else:
-            io.write_cloud(command.output, source @ result.rotation.T + result.translation)
-    if command.json:
+            io.write_cloud(path, source @ result.rotation.T + result.translation)
+
+    def write_json(path: Path) -> None:
         files = {"source": str(command.source), "reference": str(command.reference)}
         content = json.dumps(files | summary.record(result), indent=1, allow_nan=False)
-        command.json.write_text(content + "\n", "utf-8")
-    if command.plot:
-        viewer.draw_registration(command.plot, source, reference, result)
-    if command.html:
+        path.write_text(content + "\n", "utf-8")
+
+    def write_page(path: Path) -> None:
         names = (command.source.name, command.reference.name)
-        viewer.write_registration_page(command.html, source, reference, result, names=names)
-    for path in filter(None, (command.output, command.json, command.plot, command.html)):
-        _line("wrote", str(path))
+        viewer.write_registration_page(path, source, reference, result, names=names)
+
+    writers = {
+        command.output: write_output,
+        command.json: write_json,
+        command.plot: lambda path: viewer.draw_registration(path, source, reference, result),
+        command.html: write_page,
+    }
+    for path in _outputs(command):
+        try:
+            with _whole(path) as part:
+                writers[path](part)
+        except OSError as error:
+            raise ValueError(
+                f"{path} could not be written ({error.strerror or error}): choose another place."
+            ) from None
 
 
 def describe_file(command: Info) -> int:
@@ -219,9 +272,10 @@ def view_files(command: View) -> int:
 
     if not command.files:
         raise ValueError("no file to view: name at least one.")
-    _check_folder(command.output)
+    _check_place(command.output, command.files)
     clouds = {str(path): _finite(io.read_cloud(path), path) for path in command.files}
-    viewer.write_page(command.output, clouds)
+    with _whole(command.output) as part:
+        viewer.write_page(part, clouds)
     _line("wrote", str(command.output))
     if command.open:
         webbrowser.open(command.output.resolve().as_uri())
@@ -243,11 +297,13 @@ def read_matrix(path: Path) -> np.ndarray:
     """
     try:
         if path.suffix.lower() == ".json":
-            matrix = np.asarray(json.loads(path.read_text("utf-8"))["transformation"], float)
+            content = json.loads(path.read_text("utf-8"))
+            matrix = content["transformation"] if isinstance(content, dict) else content
+            matrix = np.asarray(matrix, float)
         elif path.suffix.lower() == ".npy":
             matrix = np.asarray(np.load(path, allow_pickle=False), float)
         else:
-            numbers = path.read_text("utf-8").replace(",", " ").split()
+            numbers = re.sub(r"#.*|[\[\],;]", " ", path.read_text("utf-8")).split()
             matrix = np.array(numbers, float).reshape(4, 4)
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file: correct the path.") from None
@@ -265,7 +321,7 @@ def _line(name: str, value: str) -> None:
 
 
 def _print(text: str) -> None:
-    Console(highlight=False, soft_wrap=True).print(text, markup=False)
+    Console(highlight=False, soft_wrap=True, emoji=False).print(text, markup=False)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
+import dataclasses
 import functools
 import time
 from typing import Literal, NamedTuple
@@ -86,7 +87,7 @@ def register(
         the row), `initial` is no rigid transform, or an option is unknown.
     """
     begin = time.perf_counter()
-    _check_options(rotation, refine)
+    _check_options(rotation, refine, config)
     start = None if initial is None else _check_initial(initial)
     moving = scans.make_scan(source, "source", nonfinite=nonfinite)
     fixed = scans.make_scan(reference, "reference", nonfinite=nonfinite)
@@ -114,7 +115,22 @@ def _enough(points: np.ndarray, config: RegisterConfig) -> np.ndarray:
     return np.tile(points, (-(-(config.refine_neighbors + 1) // len(points)), 1))
 
 
-def _check_options(rotation: str, refine: str | None) -> None:
+_LEAST = {
+    "search_points": 16,
+    "refine_points": 16,
+    "refine_iterations": 1,
+    "refine_anneal": 1,
+    "refine_neighbors": 2,
+}
+"""The smallest sensible value of these settings; the others must be positive."""
+
+
+def _check_options(rotation: str, refine: str | None, config: RegisterConfig) -> None:
+    for name, value in dataclasses.asdict(config).items():
+        least = _LEAST.get(name, 0)
+        if not (least <= value < np.inf and value > 0):
+            bound = f"at least {least}" if least else "positive"
+            raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
     if rotation not in ("limited", "full"):
         raise ValueError(f"rotation must be 'limited' or 'full', got {rotation!r}.")
     if refine not in ("gicp", "icp", "point_to_plane", None):
@@ -133,6 +149,11 @@ def _check_initial(initial: object) -> RigidTransform:
             ) from None
         if matrix.shape != (4, 4):
             raise ValueError(f"initial must be a 4x4 matrix [[R, t], [0, 1]], got {matrix.shape}.")
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+            raise ValueError(
+                f"the last row of initial is {matrix[3].tolist()}: give a matrix [[R, t], [0, 1]] "
+                "(this one may be transposed)."
+            )
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise ValueError("initial holds NaN or infinity: give a finite transform.")

@@ -128,15 +128,39 @@ def test_non_finite_points_are_refused_or_dropped(folder, tmp_path, capsys):
     assert len(io.read_cloud(tmp_path / "out.csv")) == 501
 
 
-def test_output_may_replace_the_source(folder, tmp_path, capsys):
-    path = tmp_path / "a.ply"
-    path.write_bytes((folder / "a.ply").read_bytes())
-    start = ("--initial", folder / "T.txt", "--refine", "none")
-    run(capsys, "register", path, folder / "b.pcd", *start, "-o", path)
-    source = io.read_cloud(folder / "a.ply")
-    np.testing.assert_allclose(
-        io.read_cloud(path), source @ TRUTH[:3, :3].T + TRUTH[:3, 3], atol=1e-6
-    )
+@pytest.mark.parametrize("option", ["--output", "--json", "--html"])
+def test_no_output_replaces_an_input(folder, tmp_path, capsys, option):
+    paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    io.write_cloud(paths[0], io.read_cloud(folder / "a.ply"))
+    paths[1].symlink_to(paths[0])
+    before = paths[0].read_bytes()
+    for path in paths:
+        status, out, err = run(capsys, "register", paths[0], folder / "b.pcd", option, path)
+        assert (status, out) == (cli.BAD_INPUT, "")
+        assert f"{path} is read or written by this command already" in err
+    assert paths[0].read_bytes() == before
+    twice = ("--json", tmp_path / "r.html", "--html", tmp_path / "r.html")
+    status, _, err = run(capsys, "register", paths[0], folder / "b.pcd", *twice)
+    assert (status, "already" in err) == (cli.BAD_INPUT, True)
+    status, _, err = run(capsys, "view", paths[0], "-o", paths[0])
+    assert (status, "already" in err) == (cli.BAD_INPUT, True)
+
+
+def test_an_output_is_whole_or_as_it_was(folder, tmp_path, capsys, monkeypatch):
+    def fails(path, *_, **__):
+        path.write_text("half a p")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("jaxreg.viewer.write_registration_page", fails)
+    page = tmp_path / "r.html"
+    page.write_text("an older page")
+    start = ("--initial", folder / "T.txt", "--refine", "none", "--html", page)
+    status, out, err = run(capsys, "register", folder / "a.ply", folder / "b.pcd", *start)
+    assert status == cli.BAD_INPUT
+    assert "verdict" in out
+    assert err.startswith(f"error: {page} could not be written (No space left on device)")
+    assert [path.name for path in tmp_path.iterdir()] == ["r.html"]
+    assert page.read_text() == "an older page"
 
 
 GOOD = "x,y,z\n" + "".join(f"{i},{i * i},{i % 3}\n" for i in range(20))
@@ -151,6 +175,14 @@ MISTAKES = {
     "holds no 4x4 matrix": ["good.csv", "good.csv", "--initial", "two.xyz"],
     "absent.txt: there is no such file": ["good.csv", "good.csv", "--initial", "absent.txt"],
     "no rigid transform": ["good.csv", "good.csv", "--initial", "scale.npy"],
+    "may be transposed": ["good.csv", "good.csv", "--initial", "transposed.npy"],
+    "config.search_points must be at least 16": [
+        "good.csv",
+        "good.csv",
+        "--config.search-points",
+        "0",
+    ],
+    "config.reach must be positive": ["good.csv", "good.csv", "--config.reach", "nan"],
 }
 
 
@@ -161,7 +193,8 @@ def test_every_mistake_is_one_line_and_status_2(tmp_path, monkeypatch, capsys, t
     Path("empty.ply").write_bytes(b"")
     Path("two.xyz").write_text("1 2 3\n4 5 6\n")
     Path("scan.docx").write_text("no cloud")
-    np.save("scale.npy", 2 * np.eye(4))
+    np.save("scale.npy", np.diag([2.0, 2, 2, 1]))
+    np.save("transposed.npy", np.eye(4) + np.eye(4, k=-3))
     status, out, err = run(capsys, "register", *MISTAKES[told])
     assert (status, out) == (cli.BAD_INPUT, "")
     assert err.startswith("error: ")
@@ -172,10 +205,10 @@ def test_every_mistake_is_one_line_and_status_2(tmp_path, monkeypatch, capsys, t
 
 def test_files_that_cannot_be_written_are_named(folder, tmp_path, capsys):
     (tmp_path / "r.json").mkdir()
-    start = ("--initial", folder / "T.txt", "--refine", "none", "--json", tmp_path / "r.json")
-    status, _, err = run(capsys, "register", folder / "a.ply", folder / "b.pcd", *start)
-    assert status == cli.BAD_INPUT
-    assert err == f"error: {tmp_path / 'r.json'}: Is a directory\n"
+    options = ("--json", tmp_path / "r.json")
+    status, out, err = run(capsys, "register", folder / "a.ply", folder / "b.pcd", *options)
+    assert (status, out) == (cli.BAD_INPUT, "")
+    assert err == f"error: {tmp_path / 'r.json'} is a directory: name a file in it.\n"
 
 
 @pytest.mark.parametrize(
@@ -221,11 +254,15 @@ def test_view_writes_a_page_and_opens_it_when_asked(folder, tmp_path, capsys, mo
     assert (status, "does not exist" in err) == (cli.BAD_INPUT, True)
 
 
-@pytest.mark.parametrize("name", ["T.txt", "T.csv", "T.npy", "T.json"])
+@pytest.mark.parametrize("name", ["T.txt", "T.csv", "T.npy", "T.json", "list.json", "print.txt"])
 def test_matrices_are_read_from_any_form(tmp_path, name):
     path = tmp_path / name
     if name.endswith("npy"):
         np.save(path, TRUTH)
+    elif name == "list.json":
+        path.write_text(json.dumps(TRUTH.tolist()))
+    elif name == "print.txt":
+        path.write_text(f"# from an earlier run\n{np.array2string(TRUTH, precision=17)}\n")
     elif name.endswith("json"):
         path.write_text(json.dumps({"transformation": TRUTH.tolist()}))
     else:
