@@ -45,10 +45,13 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
     unpickled.
 
     Raises:
-      ValueError: there is no such file, its suffix is unknown, it is malformed or truncated, or it
-        holds no point; the message names the file, the row where there is one, and the remedy.
+      ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
+        truncated, its header names columns without x, y, z, or it holds no point; the message
+        names the file, the row where there is one, and the remedy.
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory, not a file: name a file in it.")
     if path.suffix.lower() not in _READERS:
         raise ValueError(
             f"{path}: the suffix '{path.suffix}' is no format known here: convert the file to one "
@@ -67,8 +70,10 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
 def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
     """Write points in the format of the suffix; float64 wherever the format allows it.
 
+    LAS and LAZ leave out rows that are not finite; all other formats keep them.
+
     Raises:
-      ValueError: the suffix is not writable, or the folder does not exist.
+      ValueError: the suffix is not writable, the folder does not exist, or LAS gets no finite row.
     """
     path = Path(path)
     check_writable(path)

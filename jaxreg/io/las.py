@@ -22,8 +22,20 @@ def read(path: Path) -> np.ndarray:
 
 
 def write(path: Path, points: np.ndarray) -> None:
-    """Point format 0, steps of a 10^9th of the extent (the format stores integers)."""
+    """Point format 0, steps of a 10^9th of the extent (the format stores integers).
+
+    Rows that are not finite are left out: integers have no NaN. The file then holds fewer points.
+
+    Raises:
+      ValueError: laspy is missing, or no row is finite.
+    """
     laspy = _laspy(path)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        raise ValueError(
+            f"{path}: no point is finite, and LAS stores no others: check the cloud, or choose "
+            "another format."
+        )
     header = laspy.LasHeader(point_format=0, version="1.2")
     header.offsets = points.min(axis=0)
     header.scales = np.maximum(np.ptp(points, axis=0), 1e-9) * 1e-9

@@ -1,18 +1,27 @@
 """Text with a point a line: XYZ, TXT, CSV; separated by blanks, tabs, commas or semicolons."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
 
 _COMMENTS = ("#", "//")
+_MARK = re.compile(r"^\s*[#/]+")
+_LABEL = re.compile(r"^\s*\w+:\s")
+"""As in "# columns: x y z"."""
+_UNIT = re.compile(r"\s+(?=[\[(][^\W\d]+[\])])")
+"""The blank in "X [m]", which parts no columns."""
+_AXIS = re.compile(r"([xyz])(\s*[\[(].*[\])]|[\s_/](m|mm|cm|km|ft|in))?", re.IGNORECASE)
 
 
 def read(path: Path) -> np.ndarray:
     """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`.
 
-    Columns x, y, z where a header names them, else the first three; other columns are not read.
-    A first line with nothing but the number of points is skipped.
+    Columns x, y, z where a header names them, also in a comment above the points and with units
+    ("X [m]"); without a header the first three; other columns are not read. A header that has a
+    name for every column, and none of x, y, z, is an error. Other comments are skipped, and so is a
+    first line with nothing but the number of points.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -23,13 +32,14 @@ def read(path: Path) -> np.ndarray:
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if _is_data(line)]
     if not numbered:
         return np.empty((0, 3))
-    separator = _separator(numbered[min(1, len(numbered) - 1)][1])
-    columns = (0, 1, 2)
+    sample = numbered[min(1, len(numbered) - 1)][1].split("#")[0]
+    separator = _separator(sample)
     first = _split(numbered[0][1], separator)
-    if not _is_number(first[0]):
-        columns = _named_columns(first, path)
-        numbered = numbered[1:]
-    elif len(first) == 1 and len(numbered) == int(float(first[0])) + 1:
+    headed = not _is_number(first[0])
+    above = numbered[0][0] - (0 if headed else 1)
+    head = [(number, line) for number, line in enumerate(lines[:above], start=1) if line.strip()]
+    columns = _columns(path, head, separator, len(_split(sample, separator)))
+    if headed or (len(first) == 1 and len(numbered) == int(float(first[0])) + 1):
         numbered = numbered[1:]
     if not numbered:
         return np.empty((0, 3))
@@ -69,14 +79,54 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _named_columns(names: list[str], path: Path) -> tuple[int, ...]:
-    """Where x, y, z stand in a header, or the first three where it does not name them."""
-    lower = [name.lower() for name in names]
-    if set("xyz") <= set(lower):
-        return tuple(lower.index(axis) for axis in "xyz")
-    if len(names) < 3:
-        raise ValueError(f"{path}, line 1: '{' '.join(names)}' is no point: give x y z in a line.")
+def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple[int, ...]:
+    """Where x, y, z stand among `width` columns, by the lines above the points, last line first.
+
+    Raises:
+      ValueError: a header names columns, but not x, y, z; or it is a line of one or two words.
+    """
+    for _, line in reversed(head):
+        for names in _namings(line, separator):
+            axes = [_axis(name) for name in names]
+            if set("xyz") <= set(axes) and (_is_data(line) or len(names) == width):
+                return tuple(axes.index(axis) for axis in "xyz")
+    for number, line in head:
+        names = _split(_joined(line, separator), separator)
+        if _is_data(line) and len(names) < 3:
+            raise ValueError(
+                f"{path}, line {number}: '{' '.join(names)}' is no point: give x y z in a line."
+            )
+        # A comment is a header only on the first line, and not if it is a remark like "by: me".
+        titled = number == head[0][0] and all(_is_name(name) for name in names)
+        titled = titled and not _LABEL.match(_joined(line, separator))
+        if len(names) == width >= 3 and (_is_data(line) or titled):
+            raise ValueError(
+                f"{path}, line {number}: the header names the columns {', '.join(names)[:80]}, "
+                "and not x, y, z: name the columns x, y, z, or remove the header."
+            )
     return (0, 1, 2)
+
+
+def _namings(line: str, separator: str | None) -> list[list[str]]:
+    """The names in a line: split as the points are, else as the line itself suggests."""
+    text = _LABEL.sub("", _joined(line, separator))
+    own = _separator(text)
+    return [_split(text, separator), _split(_joined(text, own), own)]
+
+
+def _joined(line: str, separator: str | None) -> str:
+    """A line without its comment mark, and with units joined to names if blanks part columns."""
+    text = line if _is_data(line) else _MARK.sub("", line)
+    return text if separator else _UNIT.sub("", text)
+
+
+def _axis(name: str) -> str:
+    match = _AXIS.fullmatch(name)
+    return match[1].lower() if match else ""
+
+
+def _is_name(field: str) -> bool:
+    return any(letter.isalpha() for letter in field) and not _is_number(field)
 
 
 def _fault(path: Path, numbered: list, separator: str | None, columns: tuple[int, ...]) -> str:

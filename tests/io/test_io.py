@@ -47,6 +47,17 @@ def test_las_keeps_a_billionth_of_the_extent(tmp_path, points, suffix):
     np.testing.assert_allclose(read, points, atol=1e-8 * np.ptp(points, axis=0).max() + 1e-9)
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_leaves_out_rows_that_are_not_finite(tmp_path, points, suffix):
+    pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    path = tmp_path / f"cloud{suffix}"
+    holed = points.copy()
+    holed[[0, 7], [0, 2]], holed[9] = np.nan, np.inf
+    io.write_cloud(path, holed)
+    whole = np.delete(points, [0, 7, 9], axis=0)
+    np.testing.assert_allclose(io.read_cloud(path), whole, atol=1e-7)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("text", [False, True])
 def test_ply_of_any_byte_order_with_extra_properties(tmp_path, order, text):
@@ -101,6 +112,24 @@ def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
         "//X Y Z\n1 2 3\n4 5 6\n",
         "2\n1 2 3\n4 5 6\n",
         "\ufeff1 2 3\n4 5 6\n",
+        "# id,x,y,z\n7,1,2,3\n8,4,5,6\n",
+        "# id x y z\n7 1 2 3\n8 4 5 6\n",
+        "# id, x, y, z\n7 1 2 3\n8 4 5 6\n",
+        "# id x y z\n7,1,2,3\n8,4,5,6\n",
+        "# made by hand\n# z y x\n3 2 1\n6 5 4\n",
+        "# made by hand\nz y x\n3 2 1\n6 5 4\n",
+        "# columns: x y z\n1 2 3 9\n4 5 6 9\n",
+        "//R G X Y Z\n2\n9 9 1 2 3\n9 9 4 5 6\n",
+        "\n//Z;Y;X\n3;2;1\n6;5;4\n",
+        "t,X [m],Y [m],Z [m]\n9,1,2,3\n9,4,5,6\n",
+        "# Z (mm) Y (mm) X (mm)\n3 2 1\n6 5 4\n",
+        "z_m y_m x_m\n3 2 1\n6 5 4\n",
+        "# scanned by hand in May\n1 2 3\n4 5 6\n",
+        "# the x y z of a scan\n1 2 3\n4 5 6\n",
+        "# author: Jane Doe\n1 2 3\n4 5 6\n",
+        "# 9 9 9\n1 2 3\n4 5 6\n",
+        "# --- --- ---\n1 2 3\n4 5 6\n",
+        "1 2 3 # first of all\n4 5 6 # x y z\n",
     ],
 )
 def test_text_as_programs_write_it(tmp_path, content):
@@ -185,6 +214,14 @@ def test_obj_and_stl_agree_with_the_shape_they_were_written_from(tmp_path):
 
 def test_obj_without_faces_gives_its_vertices(tmp_path):
     (tmp_path / "a.obj").write_text("v 1 2 3\nv 4 5 6\nv 7 8 9\n")
+    np.testing.assert_array_equal(
+        io.read_cloud(tmp_path / "a.obj"), [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    )
+
+
+def test_obj_with_a_latin_1_comment(tmp_path):
+    content = "# Gerät für Größe, fläche\nv 1 2 3\nv 4 5 6\nv 7 8 9\n"
+    (tmp_path / "a.obj").write_bytes(content.encode("latin-1"))
     np.testing.assert_array_equal(
         io.read_cloud(tmp_path / "a.obj"), [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
     )

@@ -44,6 +44,12 @@ CASES = {
     "two-columns.xyz": (b"1 2 3\n4 5\n6 7 8\n", "line 2"),
     "word.txt": (b"# head\n1 2 3\n4 5 six\n", "line 3"),
     "one-word.txt": (b"hello\n1 2 3\n", "line 1"),
+    "names.csv": (b"id,a,b,c\n7,1,2,3\n", "line 1: .* id, a, b, c, .*remove the header"),
+    "no-z.csv": (b"x,y,height\n1,2,3\n", "x, y, height, and not x, y, z"),
+    "names.txt": (b"# id,a,b,c\n7,1,2,3\n8,4,5,6\n", "id, a, b, c.*name the columns x, y, z"),
+    "slashes.txt": (b"\n//R G B\n1 2 3\n4 5 6\n", "line 2: .* R, G, B"),
+    "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"remove the header"),
+    "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", "remove the header"),
     "binary.txt": (b"\xff\xfe\x00\x81" * 10, "no text"),
     "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),
     "word.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n4 x 6\n7 8 9\n", "point 1"),
@@ -104,6 +110,21 @@ def test_damaged_files_are_read_or_refused_by_name(tmp_path, seed, suffix):
 def test_missing_file(tmp_path):
     with pytest.raises(ValueError, match="no such file"):
         io.read_cloud(tmp_path / "absent.ply")
+
+
+def test_directory(tmp_path):
+    (tmp_path / "scans.ply").mkdir()
+    for path in (tmp_path, tmp_path / "scans.ply"):
+        with pytest.raises(ValueError, match="is a directory"):
+            io.read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_without_a_finite_point(tmp_path, suffix):
+    pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    with pytest.raises(ValueError, match="no point is finite"):
+        io.write_cloud(tmp_path / f"a{suffix}", np.full((4, 3), np.nan))
+    assert not (tmp_path / f"a{suffix}").exists()
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
