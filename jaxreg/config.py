@@ -211,7 +211,8 @@ class RegisterConfig:
     limited_deg: float = 80.0
     """Largest rotation between two clouds that `rotation = "limited"` looks for."""
     reach: float = 1.5
-    """A point agrees with the other cloud when it is within this many spacings of it."""
+    """A point agrees with the other cloud when it is within this many spacings of it (those of the
+    clouds reduced to `search_points`)."""
     refine_points: int = 4096
     """Most points of a cloud in the refinement."""
     refine_iterations: int = 15
