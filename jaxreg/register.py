@@ -175,7 +175,8 @@ def _searched(
     poses, score = _search()(
         *scans.padded(x, size),
         *scans.padded(y, size),
-        RigidTransform(*(part.astype(np.float32) for part in unmoved)),
+        # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
+        RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved)),
         np.float32(np.radians(largest)),
     )
     poses, score = RigidTransform(*(np.asarray(p, np.float64) for p in poses)), np.asarray(score)

@@ -287,3 +287,11 @@ def test_unrelated_points_in_a_volume_are_no_success(kind, seed):
     result = register(source, reference)
     assert not result.success
     assert result.evidence.variation > 0.17
+
+
+def test_units_that_differ_beyond_single_precision(pair):
+    for scale in (1e98, 1e-98):
+        result = register(np.ones((3, 3)), scale * np.array([[1.0, 2, 3]] * 3))
+        assert np.isfinite(result.transformation).all()
+        assert not result.success
+        assert np.isfinite(register(pair[0], scale * pair[1]).transformation).all()
