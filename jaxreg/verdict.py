@@ -23,9 +23,7 @@ class Evidence(NamedTuple):
     plane of their partner, and `facing` the mean cosine of the two normals, each compared to what
     neighbours within one cloud show: 1 and 0 when the clouds are samples of one surface.
     `constraint` is the smallest mean square change of those distances by a unit motion. `rival` is
-    how much worse, in shares of the points, the best other pose agrees. `variation` is how far from
-    flat the neighbourhoods are in the less flat cloud: the median over its points of the share of
-    the smallest principal variance, 0 on a plane and 1/3 in a volume.
+    how much worse, in shares of the points, the best other pose agrees.
     """
 
     overlap: float
@@ -34,7 +32,6 @@ class Evidence(NamedTuple):
     facing: float
     constraint: float
     rival: float
-    variation: float = 0.0
 
 
 def evidence(
@@ -70,7 +67,6 @@ def evidence(
         facing=float(np.mean(cosine) - np.mean(own_cosine)) if len(cosine) else -1.0,
         constraint=_constraint(moved[near], y_normals[index][near]),
         rival=float(rival),
-        variation=max(_variation(source), _variation(reference)),
     )
 
 
@@ -89,18 +85,6 @@ def _own(cloud: IndexedCloud):
     index = cloud.tree.query(cloud.points, k=2, workers=-1)[1][:, 1]
     normals = _normals(cloud)
     return _beside(cloud.points, cloud.points[index], normals, normals[index])
-
-
-def _variation(cloud: IndexedCloud) -> float:
-    """Median surface variation (Pauly et al. 2002); 0 for clouds of too few points to tell."""
-    if len(cloud.points) < _ENOUGH_TO_TELL:
-        return 0.0
-    index = cloud.tree.query(cloud.points, k=_NEIGHBORHOOD, workers=-1)[1]
-    patch = cloud.points[index]
-    centred = patch - patch.mean(axis=1, keepdims=True)
-    values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", centred, centred))
-    total = values.sum(axis=1)
-    return float(np.median(values[total > 0, 0] / total[total > 0])) if (total > 0).any() else 0.0
 
 
 def _median(values: np.ndarray, default: float) -> float:
@@ -122,10 +106,9 @@ def _constraint(points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 
 def probability(found: Evidence) -> float:
     """The chance that the pose is right: a logistic regression, whose constants' origin is below.
 
-    0 where the clouds leave a motion free, as planes do: no pose is the right one then. 0 also
-    where a cloud fills a volume: two of those agree in every pose.
+    0 where the clouds leave a motion free, as planes do: no pose is the right one then.
     """
-    if found.constraint < _LEAST_CONSTRAINT or found.variation > _MOST_VARIATION:
+    if found.constraint < _LEAST_CONSTRAINT:
         return 0.0
     inputs = features(found)
     return float(1 / (1 + np.exp(-np.clip(_INTERCEPT + inputs @ _COEFFICIENTS, -50, 50))))
@@ -146,10 +129,6 @@ def features(found: Evidence) -> Float[np.ndarray, "6"]:
 
 
 _LEAST_CONSTRAINT = 1e-5
-_NEIGHBORHOOD, _ENOUGH_TO_TELL = 17, 256
-_MOST_VARIATION = 0.175
-"""Points in a cube show 0.21, in a slab a tenth as thick 0.17 to 0.18; the least flat of 180 test
-shapes and real fragments, one with noise, 0.166."""
 _INTERCEPT = 3.07
 _COEFFICIENTS = np.array([2.51, 1.94, -1.91, 7.03, 1.98, 2.77])
 """Fitted by benchmarks/calibrate_success.py (2026-11-25) to 200 pairs of procedural shapes and 200
