@@ -14,6 +14,7 @@ import sys
 import types
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -31,7 +32,11 @@ BLOCK = re.compile(r"```(python|sh)\n(.*?)```\n(?:\n```\n(.*?)```\n)?", re.DOTAL
 
 
 def run_python(code: str, names: dict) -> str:
-    with contextlib.redirect_stdout(streams.StringIO()) as printed:
+    # Readers write `points + translation`, as the field does.
+    with (
+        contextlib.redirect_stdout(streams.StringIO()) as printed,
+        jax.numpy_rank_promotion("allow"),
+    ):
         exec(compile(code, "example", "exec"), names)  # noqa: S102
     return printed.getvalue()
 
