@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from jaxreg import scoring
+from jaxreg import io, scoring
 from jaxreg.compilation import enable_compilation_cache
 from jaxreg.config import Config
 from jaxreg.data import data_root
@@ -71,8 +71,8 @@ def _check(options: Options) -> None:
             "--batch 1 or more."
         )
     for path in (options.json, options.picture, options.save_pairs, options.save_transforms):
-        if path and not Path(path).parent.is_dir():
-            raise ValueError(f"{path}: there is no folder {Path(path).parent}: make it first.")
+        if path:
+            io.check_folder(Path(path))
 
 
 def main() -> None:

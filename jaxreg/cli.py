@@ -174,8 +174,9 @@ def _check_outputs(command: Register) -> None:
 
 def _check_place(path: Path, taken: Sequence[Path]) -> None:
     """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
+    from jaxreg import io
+
+    io.check_folder(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory: name a file in it.")
     if path.resolve() in [other.resolve() for other in taken]:
@@ -230,16 +231,20 @@ def _write_results(command: Register, source, reference, result) -> None:
         names = (command.source.name, command.reference.name)
         viewer.write_registration_page(path, source, reference, result, names=names)
 
-    writers = {
-        command.output: write_output,
-        command.json: write_json,
-        command.plot: lambda path: viewer.draw_registration(path, source, reference, result),
-        command.html: write_page,
-    }
-    for path in _outputs(command):
+    def draw(path: Path) -> None:
+        viewer.draw_registration(path, source, reference, result)
+
+    for path, write in (
+        (command.output, write_output),
+        (command.json, write_json),
+        (command.plot, draw),
+        (command.html, write_page),
+    ):
+        if path is None:
+            continue
         try:
             with _whole(path) as part:
-                writers[path](part)
+                write(part)
         except OSError as error:
             raise ValueError(
                 f"{path} could not be written ({error.strerror or error}): choose another place."

@@ -11,8 +11,9 @@ from jaxreg import losses, model
 from jaxreg.config import Config, LossConfig, ModelConfig
 from jaxreg.features import BATCH_AXIS
 from jaxreg.model import init_variables, register_pair
-from jaxreg.neighbors import knn, nearest_neighbor
+from jaxreg.neighbors import nearest_neighbor
 from jaxreg.types import PointCloud
+from tests.compiled import knn
 from tests.scenes import shape
 
 # Flax promotes float64 with the float32 that it starts from.
@@ -187,6 +188,6 @@ def test_t25_a_regular_grid_has_constant_features():
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     for reference in (grid, grid + 0.25, 2 * grid):
         assert_finite(run_network(grid, reference))
-    index = np.asarray(jax.jit(knn, static_argnums=1)(grid, 6))
+    index = np.asarray(knn(grid, 6))
     # The six nearest of the middle one are the middles of the six faces.
     np.testing.assert_allclose(np.linalg.norm(grid[index[13]] - grid[13], axis=1), 1)

@@ -14,9 +14,9 @@ from jaxreg.config import LossConfig, ModelConfig
 from jaxreg.losses import LossTerms
 from jaxreg.matching import Matches
 from jaxreg.model import Step, neighborhood_graph
-from jaxreg.neighbors import knn
 from jaxreg.types import PointCloud, RigidTransform
 from tests import oracles
+from tests.compiled import knn
 
 N, M, K, N_C, BETA = 14, 17, 3, 6, 0.01
 MODEL = ModelConfig(k=K, k_matching=K, n_inliers=N_C)
@@ -38,7 +38,7 @@ def draw_step(rng, n=N):
     transform = RigidTransform(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
     moved = source @ transform.rotation.T + transform.translation
     copy = moved + 0.3 * rng.normal(size=(n, 3))
-    neighbors = np.asarray(jax.jit(knn, static_argnums=1)(source, K))
+    neighbors = np.asarray(knn(source, K))
     inliers = rng.permutation(n)[:N_C].astype(np.int32)
     peaks = rng.uniform(0.1, 2, (2, n))
     step = Step(source, moved, transform, Matches(copy, *peaks), rng.uniform(size=n), inliers)

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.config import Config, ModelConfig
 from jaxreg.model import init_variables, iterate, register_pair
-from jaxreg.neighbors import knn
 from jaxreg.types import PointCloud
 from tests import oracles
+from tests.compiled import knn
 
 # Flax promotes float64 with the float32 that it starts from.
 pytestmark = pytest.mark.loose
@@ -32,7 +32,6 @@ READINGS = {
     "raw coordinates": {"edge": "coordinates", "angles": "none", "svd": "all"},
     "with the point itself": {"include_self": True},
 }
-graph_of = jax.jit(knn, static_argnums=1)
 
 
 @functools.cache
@@ -87,7 +86,7 @@ def assert_same(a, b, **tolerance):
 
 
 def neighbors_of(points, k, config):
-    idx = np.asarray(graph_of(points, k))
+    idx = np.asarray(knn(points, k))
     own = np.arange(len(points))[:, None]
     return np.concatenate([own, idx], axis=1) if config.include_self else idx
 
@@ -101,8 +100,8 @@ def step_by_loops(variables, source, reference, config, inliers):
         return oracles.dgcnn(params["features"], statistics["features"], points, graph)
 
     clouds = source, reference
-    graphs = [np.asarray(graph_of(x, config.k_matching)) for x in clouds]
-    nearest = [np.asarray(graph_of(x, 1))[:, 0] for x in clouds]
+    graphs = [np.asarray(knn(x, config.k_matching)) for x in clouds]
+    nearest = [np.asarray(knn(x, 1))[:, 0] for x in clouds]
     of_points = [features(x) for x in clouds]
     distance = oracles.feature_distance(*of_points)
     of_nearest, own_graphs = None, None
@@ -113,7 +112,7 @@ def step_by_loops(variables, source, reference, config, inliers):
     elif config.one_nn == "own":
         patches = [x[i] for x, i in zip(clouds, nearest, strict=True)]
         of_nearest = [features(x) for x in patches]
-        own_graphs = [np.asarray(graph_of(x, config.k_matching)) for x in patches]
+        own_graphs = [np.asarray(knn(x, config.k_matching)) for x in patches]
     nearest_distance = None if of_nearest is None else oracles.feature_distance(*of_nearest)
     _, dual, final = oracles.maps(distance, nearest_distance, *graphs, config.alpha, own_graphs)
     copy = final @ reference

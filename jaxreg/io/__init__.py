@@ -87,5 +87,10 @@ def check_writable(path: Path) -> None:
             f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
             f"{', '.join(WRITABLE)}."
         )
+    check_folder(path)
+
+
+def check_folder(path: Path) -> None:
+    """Raises ValueError unless there is a folder for the file."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
