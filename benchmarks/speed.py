@@ -14,6 +14,7 @@ ModelNet40 protocol: three quarters kept, up to 45 degrees an axis.
 `stages`    time and counted arithmetic of every stage, against the machine's matrix product
 `programs`  compile time and peak memory of a fresh process for each program
 `first`     a fresh process to its first result, with an empty and with a warm compilation cache
+`accuracy`  the same evaluation with each optimisation taken away
 """
 
 import dataclasses
@@ -29,10 +30,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import candidates, processes, stages
+from benchmarks import accuracy, candidates, processes, stages
 from jaxreg.compilation import restart_with_huge_pages
 
-Part = Literal["forward", "training", "stages", "programs", "first"]
+Part = Literal["forward", "training", "stages", "programs", "first", "accuracy"]
 CONSOLE = Console(width=110)
 
 
@@ -40,13 +41,15 @@ CONSOLE = Console(width=110)
 class Options:
     """What to measure."""
 
-    parts: tuple[Part, ...] = ("forward", "training", "stages", "programs", "first")
+    parts: tuple[Part, ...] = ("forward", "training", "stages", "programs", "first", "accuracy")
     points: tuple[int, ...] = (768, 1434, 2048, 4096)
     """Sizes of the clouds in `forward`; the other parts take the first."""
     batch: int = 8
     """Pairs at once."""
     transcription_points: int = 1434
     """Largest size at which the equations as written are timed too."""
+    accuracy_pairs: int = 64
+    """Pairs of `accuracy`."""
     rounds: int = 5
     """Timed runs of every candidate."""
     seconds: float = 10.0
@@ -202,6 +205,25 @@ def programs(options: Options) -> list[dict]:
     return rows
 
 
+def show_accuracy(options: Options) -> list[dict]:
+    """The table of variants; returns its rows."""
+    rows = accuracy.measure(options.points[0], options.batch, options.accuracy_pairs)
+    shown = [
+        {
+            "": row["variant"],
+            "dtype": row["dtype"],
+            "MAE(R), deg": f"{row['mae_r_deg']:.2e}",
+            "worst": f"{row['worst_deg']:.2e}",
+            "MAE(R) - first": f"{row['difference_deg']:+.1e}",
+            "farthest from it": f"{row['apart_deg']:.1e}",
+        }
+        for row in rows
+    ]
+    title = f"accuracy, {options.points[0]} points, {options.accuracy_pairs} pairs"
+    CONSOLE.print(simple_table(title, shown))
+    return rows
+
+
 def confine(cores: int) -> None:
     """Start again on the first `cores` cores: XLA and OpenMP count the cores once, as they start."""
     allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
@@ -244,6 +266,8 @@ def main() -> None:
         if part in options.parts:
             rows = results[part] = run(options)
             CONSOLE.print(simple_table(f"{title}, {options.points[0]} points", rows))
+    if "accuracy" in options.parts:
+        results["accuracy"] = show_accuracy(options)
     if options.json:
         Path(options.json).write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

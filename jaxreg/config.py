@@ -215,7 +215,7 @@ class RegisterConfig:
     clouds reduced to `search_points`)."""
     refine_points: int = 4096
     """Most points of a cloud in the refinement."""
-    refine_iterations: int = 15
+    refine_iterations: int = 10
     """Most iterations of the refinement."""
     refine_anneal: float = 8.0
     """How many times wider its kernel is in the first iteration than in the last."""
@@ -252,12 +252,18 @@ class DenseConfig:
     """Cells of the nearest-point grid along each axis."""
     screen_width: float = 0.06
     """Width of the Gaussian overlap that all poses are screened by."""
-    screened: int = 32
-    """Distinct poses that are aligned and ranked."""
+    screened: int = 64
+    """Distinct poses that are aligned coarsely."""
     distinct_angle: float = 0.26
     """Poses are distinct when they turn by more than this from each other,"""
     distinct_distance: float = 0.15
     """or move the centroid of the source farther apart than this."""
+    aligned: int = 8
+    """Poses that are aligned and ranked with all their neighbours afterwards,"""
+    aligned_angle: float = 0.1
+    """distinct by this angle"""
+    aligned_distance: float = 0.05
+    """or this distance."""
     coarse_step: int = 2
     """Every so-manieth point is screened and refined coarsely."""
     coarse_widths: tuple[float, ...] = (0.15, 0.12, 0.1, 0.08, 0.06, 0.05)

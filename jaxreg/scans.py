@@ -15,6 +15,8 @@ from jaxreg.types import RigidTransform
 _LARGEST = 1e100
 """Coordinates beyond would overflow when squared."""
 _FINEST = 1e-6
+_CUBES = 1 << 20
+"""Up to so many cubes a table of all of them is quicker than to sort the occupied ones."""
 _FEWEST = 3
 """Two points leave a rotation about the line between them."""
 
@@ -167,9 +169,12 @@ def voxel_reduced(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.nda
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     extent = cell.max(axis=0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    _, index, count = np.unique(key, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index, weights=axis) for axis in points.T], axis=1)
-    return sums / count[:, None]
+    if np.prod(extent.astype(float)) > _CUBES:
+        _, key = np.unique(key, return_inverse=True)
+    count = np.bincount(key)
+    occupied = np.flatnonzero(count)
+    sums = np.stack([np.bincount(key, weights=axis)[occupied] for axis in points.T], axis=1)
+    return sums / count[occupied, None]
 
 
 def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "v 3"]:

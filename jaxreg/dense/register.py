@@ -16,7 +16,7 @@ from jaxreg.dense.hypotheses import best_of, pick_distinct, pose_hypotheses, scr
 from jaxreg.dense.moments import moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
-from jaxreg.dense.verification import evidence, plausibility
+from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
 from jaxreg.neighbors import squared_distances
 from jaxreg.numerics import safe_sqrt
 from jaxreg.refine import frame
@@ -149,8 +149,10 @@ def _search(
     fine = lambda pose: align_fine(  # noqa: E731
         pose, few, fewer, config.fine_widths, thickness=config.thickness
     )
-    poses = jax.lax.map(fine, jax.vmap(coarse)(poses))
-    return _ranked(poses, source, reference, largest_angle, config)
+    widening = _widening(source, reference, config)
+    poses = _shortlist(jax.vmap(coarse)(poses), source, reference, grids, widening, config)
+    poses = jax.lax.map(fine, poses)
+    return _ranked(poses, source, reference, widening, largest_angle, config)
 
 
 def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: DenseConfig):
@@ -210,13 +212,48 @@ def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]
     return trace >= 1 + 2 * jnp.cos(angle) - 1e-5
 
 
+def _shortlist(
+    poses,
+    source: Surface,
+    reference: Surface,
+    grids: list[NearestGrid],
+    widening: Array,
+    config: DenseConfig,
+) -> RigidTransform:
+    """The distinct poses that are plausible at a glance: the last alignment is what takes time."""
+    found = jax.vmap(
+        lambda pose: evidence_by_grid(
+            pose,
+            source,
+            reference,
+            grids[1],
+            grids[0],
+            step=config.coarse_step,
+            width=config.match_width * widening,
+            plane_width=config.plane_width * widening,
+            rim=config.rim,
+        )
+    )(poses)
+    score = _score(found, config)
+    chosen = pick_distinct(
+        poses,
+        score,
+        count=min(config.aligned, len(score)),
+        angle=config.aligned_angle,
+        distance=config.aligned_distance,
+    )
+    return best_of(poses, chosen)
+
+
 def _ranked(
-    poses, source: Surface, reference: Surface, largest_angle, config: DenseConfig
+    poses,
+    source: Surface,
+    reference: Surface,
+    widening: Array,
+    largest_angle,
+    config: DenseConfig,
 ) -> Search:
     """The poses, the most plausible first, and their plausibility."""
-    # Points of sparse clouds are beside each other although their surfaces match.
-    sparse = jnp.maximum(_spacing(source), _spacing(reference)) / config.dense_spacing
-    widening = jnp.maximum(sparse, 1)
     found = jax.lax.map(
         lambda pose: evidence(
             pose,
@@ -228,11 +265,21 @@ def _ranked(
         ),
         poses,
     )
-    score = plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
+    score = _score(found, config)
     # Alignment may have turned a pose out of the bounds of the search.
     score = jnp.where(_turns_less(poses, largest_angle), score, score - 10)
     score, order = jax.lax.top_k(score, len(score))
     return Search(best_of(poses, order), score)
+
+
+def _score(found: Evidence, config: DenseConfig) -> Float[Array, "s"]:
+    return plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
+
+
+def _widening(source: Surface, reference: Surface, config: DenseConfig) -> Float[Array, ""]:
+    """Points of sparse clouds are beside each other although their surfaces match."""
+    sparse = jnp.maximum(_spacing(source), _spacing(reference)) / config.dense_spacing
+    return jnp.maximum(sparse, 1)
 
 
 def _spacing(surface: Surface) -> Float[Array, ""]:

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.lax import Precision
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg import rigid
-from jaxreg.dense.nearest import nearest_packed
-from jaxreg.dense.surface import Surface
+from jaxreg.dense.nearest import NearestGrid, lookup, nearest_packed
+from jaxreg.dense.surface import Surface, thinned
 from jaxreg.types import RigidTransform
 
 
@@ -50,13 +50,44 @@ def evidence(
     E[k exp(-h^2 / 2 plane_width^2) c^2]``, ``alike = E[k s]``, ``within = E[k i i']``, ``beside =
     E[i']`` over the points with d between 1.5 and 3 `width` (0 for the others).
     """
-    moved = source._replace(
-        points=rigid.apply(pose, source.points),
-        normals=jnp.matmul(source.normals, pose.rotation.T, precision=Precision.HIGHEST),
-    )
-    there = _one_way(moved, reference, width, plane_width, rim)
-    back = _one_way(reference, moved, width, plane_width, rim)
+    moved = _moved(pose, source)
+    forward = nearest_packed(moved.points, reference.points, reference.mask)
+    backward = nearest_packed(reference.points, moved.points, source.mask)
+    there = _one_way(moved, reference, forward, width, plane_width, rim)
+    back = _one_way(reference, moved, backward, width, plane_width, rim)
     return Evidence(*(a + b for a, b in zip(there, back, strict=True)))
+
+
+def evidence_by_grid(
+    pose: RigidTransform,
+    source: Surface,
+    reference: Surface,
+    source_grid: NearestGrid,
+    reference_grid: NearestGrid,
+    *,
+    step: int,
+    width: Float[Array, ""] | float,
+    plane_width: Float[Array, ""] | float,
+    rim: float,
+) -> Evidence:
+    """About `evidence`, of every `step`-th point and with the nearest points of the grids.
+
+    Some forty times faster on a CPU: enough to drop poses that are far from the best.
+    """
+    moved = _moved(pose, thinned(source, step))
+    back = _moved(rigid.inverse(pose), thinned(reference, step))
+    forward = lookup(reference_grid, moved.points)
+    backward = lookup(source_grid, back.points)
+    there = _one_way(moved, reference, forward, width, plane_width, rim)
+    back = _one_way(back, source, backward, width, plane_width, rim)
+    return Evidence(*(a + b for a, b in zip(there, back, strict=True)))
+
+
+def _moved(pose: RigidTransform, surface: Surface) -> Surface:
+    return surface._replace(
+        points=rigid.apply(pose, surface.points),
+        normals=jnp.matmul(surface.normals, pose.rotation.T, precision=Precision.HIGHEST),
+    )
 
 
 def plausibility(
@@ -70,11 +101,11 @@ def plausibility(
 def _one_way(
     moved: Surface,
     other: Surface,
+    nearest: Int[Array, "n"],
     width: Float[Array, ""] | float,
     plane_width: Float[Array, ""] | float,
     rim: float,
 ) -> tuple[Array, Array, Array, Array]:
-    nearest = nearest_packed(moved.points, other.points, other.mask)
     residual = moved.points - other.points[nearest]
     normal = other.normals[nearest]
     squared = jnp.sum(residual**2, axis=-1)

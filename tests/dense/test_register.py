@@ -8,7 +8,7 @@ from jaxreg.config import DenseConfig
 from jaxreg.dense import register_dense
 
 pytestmark = [pytest.mark.float32]
-CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=12)
+CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=24, aligned=8)
 
 
 @jax.jit

@@ -3,8 +3,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
+from jaxreg.dense.nearest import nearest_grid
 from jaxreg.dense.surface import Surface
-from jaxreg.dense.verification import Evidence, evidence, plausibility
+from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
 from jaxreg.types import RigidTransform
 
 
@@ -59,6 +60,22 @@ def test_padding_counts_for_nothing():
         np.array(evidence(identity, cut, b, **WIDTHS)),
         rtol=1e-9,
     )
+
+
+def test_grids_give_about_the_evidence_and_every_other_point_is_enough(seed):
+    rng = np.random.default_rng(seed)
+    source, reference = plane(0.0, 0.05), plane(0.0, 0.1, local=(0.8, 0.6))
+    # Off the lattice, where the nearest point is one and not any of four.
+    shift = jnp.asarray([*rng.uniform(-0.02, 0.02, 2), 0.01])
+    pose = RigidTransform(jnp.eye(3), shift)
+    grids = [nearest_grid(s.points, s.mask, cells=64, margin=0.06) for s in (source, reference)]
+    exact = np.array(evidence(pose, source, reference, **WIDTHS))
+    for step in (1, 2):
+        found = evidence_by_grid(pose, source, reference, *grids, step=step, **WIDTHS)
+        np.testing.assert_allclose(np.array(found), exact, rtol=0.05, atol=1e-6)
+    away = pose._replace(translation=shift + jnp.asarray([0.0, 0, 0.1]))
+    found = evidence_by_grid(away, source, reference, *grids, step=2, **WIDTHS)
+    assert found.beside > 1 > 0.1 > found.match
 
 
 def test_plausibility_is_linear_in_the_evidence():
