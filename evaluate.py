@@ -6,7 +6,6 @@ Every method meets the same pairs and the same metrics, in float64 from transfor
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from jaxreg import io, scoring
 from jaxreg.compilation import enable_compilation_cache
 from jaxreg.config import Config
 from jaxreg.data import data_root
-from jaxreg.options import parse
+from jaxreg.options import parse, stop
 from jaxreg.report import results_table
 
 _CHOICE = (
@@ -86,7 +85,9 @@ def main() -> None:
         result = scoring.score(options.config, root=root, **chosen)
         _write_extras(options, root)
     except ValueError as error:
-        sys.exit(f"error: {error}")
+        stop(str(error))
+    except KeyboardInterrupt:
+        stop("interrupted", status=130)
     result["config"] = path.stem
     Console().print(results_table([result], title=str(path)))
     if options.json:

@@ -5,7 +5,6 @@ checkpoint by validation error.
 """
 
 import dataclasses
-import sys
 from typing import Annotated
 
 import tyro
@@ -13,7 +12,7 @@ import tyro
 from jaxreg.compilation import enable_compilation_cache, restart_with_huge_pages
 from jaxreg.config import Config
 from jaxreg.data import data_root
-from jaxreg.options import parse
+from jaxreg.options import parse, stop
 from jaxreg.pictures import plot_curves
 from jaxreg.training import release, train
 
@@ -40,9 +39,9 @@ def main() -> None:
         root = data_root(options.data_root, path)
         train(options.config, workdir, root=root)
     except (ValueError, FloatingPointError) as error:
-        sys.exit(f"error: {error}")
+        stop(str(error))
     except KeyboardInterrupt:
-        sys.exit("interrupted: the same command goes on from the newest checkpoint")
+        stop("interrupted: the same command goes on from the newest checkpoint", status=130)
     plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
     if options.release:
         command = f"python train.py {path} --workdir {workdir}"

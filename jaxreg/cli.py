@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import re
+import sys
 import webbrowser
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from jaxreg import __version__
 from jaxreg.config import RegisterConfig
 
 SUCCESS, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 2, 3, 130
@@ -26,7 +28,8 @@ _COMPILING = (
     "compiling for clouds of these sizes, about 10 s; the programs are kept in\n"
     "{directory}, so that later runs need not."
 )
-_HINT = "look at it with --html PAGE.html; a rough pose to start from helps: --initial T.txt"
+_HINT = "look at it with --html PAGE.html"
+_START = "; a rough pose to start from helps: --initial T.txt"
 
 
 def _path(**options):
@@ -50,7 +53,7 @@ class Register:
     reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
     """Cloud that stays."""
     output: Output = None
-    """Write the aligned source here (PLY keeps colours and other properties)."""
+    """Write the aligned source here (PLY and LAS keep colours and whatever else they hold)."""
     json: OptionalPath = None
     """Write transform, figures and verdict here (JSON)."""
     plot: OptionalPath = None
@@ -91,10 +94,13 @@ class View:
 
 def main(arguments: list[str] | None = None) -> int:
     """The console script `jaxreg`; returns the exit status."""
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        _print(f"jaxreg {__version__}")
+        return SUCCESS
     command = tyro.extras.subcommand_cli_from_dict(
         {"register": Register, "info": Info, "view": View},
         prog="jaxreg",
-        description="Rigid registration of point clouds.",
+        description="Rigid registration of point clouds (jaxreg --version tells which).",
         args=arguments,
     )
     run = {Register: register_files, Info: describe_file, View: view_files}[type(command)]
@@ -138,7 +144,7 @@ def register_files(command: Register) -> int:
     for path in _outputs(command):
         _line("wrote", str(path))
     if not result.success:
-        _line("hint", _HINT)
+        _line("hint", _HINT if command.initial else _HINT + _START)
     return SUCCESS if result.success else NOT_TRUSTED
 
 
@@ -217,8 +223,11 @@ def _write_results(command: Register, source, reference, result) -> None:
     from jaxreg import io, summary, viewer
 
     def write_output(path: Path) -> None:
-        if path.suffix.lower() == command.source.suffix.lower() == ".ply":
+        kinds = [p.suffix.lower() for p in (command.source, path)]
+        if kinds == [".ply", ".ply"]:
             io.ply.write_moved(path, command.source, result.rotation, result.translation)
+        elif set(kinds) <= {".las", ".laz"}:
+            io.las.write_moved(path, command.source, result.rotation, result.translation)
         else:
             io.write_cloud(path, source @ result.rotation.T + result.translation)
 

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import tyro
 
@@ -26,10 +26,15 @@ def parse(
         try:
             config = load_config(path)
         except ValueError as error:
-            print(f"error: {error}", file=sys.stderr)  # noqa: T201
-            raise SystemExit(2) from None
+            stop(str(error))
     program = f"{Path(sys.argv[0]).name} CONFIG.toml"
     parsed = tyro.cli(
         options, default=options(config=config), args=rest, prog=program, description=description
     )
     return path, parsed
+
+
+def stop(message: str, *, status: int = 2) -> NoReturn:
+    """End the program with one message: status 2 for bad input, as `jaxreg` does."""
+    print(f"error: {message}" if status == 2 else message, file=sys.stderr)  # noqa: T201
+    raise SystemExit(status)

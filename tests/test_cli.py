@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+import jaxreg
 from jaxreg import cli, compilation, io
 from jaxreg.data import shapes
 
@@ -93,6 +94,27 @@ def test_json_is_strict_and_complete(registered):
     assert "correspondences" not in found
 
 
+def test_las_keeps_its_intensity(folder, tmp_path, capsys):
+    laspy = pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    points = io.read_cloud(folder / "a.ply")
+    io.write_cloud(tmp_path / "a.las", points)
+    cloud = laspy.read(tmp_path / "a.las")
+    cloud.intensity = np.arange(500)
+    cloud.write(str(tmp_path / "a.las"))
+    np.savetxt(tmp_path / "T.txt", TRUTH)
+    files = (tmp_path / "a.las", folder / "b.pcd", "--initial", tmp_path / "T.txt")
+    status, _, _ = run(capsys, "register", *files, "-o", tmp_path / "out.las")
+    assert status == cli.SUCCESS
+    aligned = laspy.read(tmp_path / "out.las")
+    np.testing.assert_array_equal(aligned.intensity, np.arange(500))
+    expected = points @ TRUTH[:3, :3].T + TRUTH[:3, 3]
+    assert np.linalg.norm(aligned.xyz - expected, axis=1).mean() < 1.0
+
+
+def test_version(capsys):
+    assert run(capsys, "--version")[:2] == (cli.SUCCESS, f"jaxreg {jaxreg.__version__}\n")
+
+
 def test_an_earlier_result_is_a_start(registered, capsys):
     folder, _ = registered
     files = (folder / "a.ply", folder / "b.pcd")
@@ -111,7 +133,8 @@ def test_wrong_pose_is_not_trusted(folder, tmp_path, capsys):
     status, out, _ = run(capsys, "register", folder / "a.ply", folder / "b.pcd", *options)
     assert status == cli.NOT_TRUSTED
     assert "verdict          not trustworthy (probability 0.0" in out
-    assert "--initial" in out.splitlines()[-1]
+    # A start pose was given: another is not what to try next.
+    assert out.splitlines()[-1].endswith("--html PAGE.html")
 
 
 def test_non_finite_points_are_refused_or_dropped(folder, tmp_path, capsys):

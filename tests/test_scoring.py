@@ -121,3 +121,13 @@ def test_a_mistake_on_the_command_line_is_one_line(tmp_path):
     assert done.returncode == 2
     assert "did you mean 'alpha'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_data_that_is_not_there_is_one_line_and_status_2(tmp_path, script):
+    toml = tmp_path / "c.toml"
+    toml.write_text('[data]\nname = "modelnet40"\n')
+    done = run(script, toml, "--data-root", tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.splitlines()) == 1

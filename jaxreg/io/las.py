@@ -36,10 +36,24 @@ def write(path: Path, points: np.ndarray) -> None:
             f"{path}: no point is finite, and LAS stores no others: check the cloud, or choose "
             "another format."
         )
-    header = laspy.LasHeader(point_format=0, version="1.2")
-    header.offsets = points.min(axis=0)
-    header.scales = np.maximum(np.ptp(points, axis=0), 1e-9) * 1e-9
-    cloud = laspy.LasData(header)
+    _store(laspy.LasData(laspy.LasHeader(point_format=0, version="1.2")), points, path)
+
+
+def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
+    """The file `original` with its points turned and moved; errors as `read`.
+
+    Intensity, colours, times and whatever else it stores for a point stay.
+    """
+    laspy = _laspy(path)
+    cloud = laspy.read(original)
+    _store(cloud, np.asarray(cloud.xyz, np.float64) @ rotation.T + translation, path)
+
+
+def _store(cloud, points: np.ndarray, path: Path) -> None:
+    offsets, scales = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-9) * 1e-9
+    # The header is written, but the coordinates are turned to integers by what the record holds.
+    for holder in (cloud.header, cloud.points):
+        holder.offsets, holder.scales = offsets, scales
     cloud.xyz = points
     cloud.write(str(path))
 

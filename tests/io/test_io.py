@@ -48,6 +48,26 @@ def test_las_keeps_a_billionth_of_the_extent(tmp_path, points, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_moved_las_keeps_what_else_it_stores(tmp_path, points, suffix):
+    laspy = pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+    cloud.header.offsets, cloud.header.scales = points.min(axis=0), [1e-3] * 3
+    cloud.points.offsets, cloud.points.scales = cloud.header.offsets, cloud.header.scales
+    cloud.xyz = points
+    cloud.intensity, cloud.red = np.arange(40), np.arange(40) * 7
+    cloud.gps_time = np.arange(40) / 3
+    cloud.write(str(tmp_path / f"a{suffix}"))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    shift = np.array([-4e6, 2e6, 5.0])  # Out of the range of the integers of the original.
+    io.las.write_moved(tmp_path / f"b{suffix}", tmp_path / f"a{suffix}", turn, shift)
+    moved = io.read_cloud(tmp_path / f"a{suffix}") @ turn.T + shift
+    np.testing.assert_allclose(io.read_cloud(tmp_path / f"b{suffix}"), moved, atol=1e-6)
+    found = laspy.read(tmp_path / f"b{suffix}")
+    for name in ("intensity", "red", "gps_time"):
+        np.testing.assert_array_equal(found[name], cloud[name])
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las_leaves_out_rows_that_are_not_finite(tmp_path, points, suffix):
     pytest.importorskip("laspy", reason="the extra `las` is not installed")
     path = tmp_path / f"cloud{suffix}"
