@@ -3,10 +3,11 @@
     python benchmarks/tables.py [--data-root DATA] [--predecessor rie_modelnet.npz] [--only COLUMN ...]
 
 Networks meet all pairs of a column, classical methods the first `--baseline-pairs`. A finished cell
-leaves FOLDER/COLUMN-ROW.json and is not made again unless `--again`; the tables are printed from
-these files. "+ robust Procrustes" solves every step's Procrustes again with less weight on pairs that
-it cannot explain (`--model.robust-rounds 3`); "+ icp" refines the network's poses at the end
-(`--refine icp`). Both leave the weights as they are.
+leaves FOLDER/COLUMN-ROW.json and its transforms (.npz), and is not made again unless `--again`; the
+tables are printed from these files. "+ robust Procrustes" solves every step's Procrustes again with
+less weight on pairs that it cannot explain (`--model.robust-rounds 3`); "+ icp" refines the poses of
+the first row (`--transforms FILE.npz --refine icp`; its seconds are those of the refinement alone).
+Both leave the weights as they are.
 """
 
 import dataclasses
@@ -93,7 +94,8 @@ def rows(column: Column, options: Options) -> dict[str, dict[str, Any]]:
     found = {
         "jaxreg": {"pairs": options.pairs},
         "jaxreg + robust Procrustes": {"pairs": options.pairs, "rounds": 3},
-        "jaxreg + icp": {"pairs": options.pairs, "refine": "icp"},
+        # From the transforms of the first row, which need not be made again.
+        "jaxreg + icp": {"pairs": options.pairs, "refine": "icp", "start": "jaxreg"},
     }
     if options.predecessor:
         chosen = {"predecessor": options.predecessor, "pairs": options.predecessor_pairs}
@@ -110,17 +112,28 @@ def evaluate(name: str, options: Options, root: Path | None) -> None:
     config = column_config(column, root)
     for row, chosen in rows(column, options).items():
         model = dataclasses.replace(config.model, robust_rounds=chosen.pop("rounds", 0))
-        path = folder / f"{name}-{''.join(c if c.isalnum() else '_' for c in row)}.json"
+        path = _cell(folder, name, row)
+        if start := chosen.pop("start", ""):
+            chosen["transforms"] = str(_cell(folder, name, start).with_suffix(".npz"))
         unwanted = options.rows and row not in options.rows
         if unwanted or (path.is_file() and not options.again):
             continue
         print(f"{name}: {row}", flush=True)
         try:
-            result = scoring.score(dataclasses.replace(config, model=model), root=root, **chosen)
+            result = scoring.score(
+                dataclasses.replace(config, model=model),
+                root=root,
+                save_transforms=str(path.with_suffix(".npz")),
+                **chosen,
+            )
         except ValueError as error:  # Weights or a library that are not there.
             print(f"  left out: {error}")
             continue
         path.write_text(json.dumps({"row": row, "config": column.config} | result, indent=1) + "\n")
+
+
+def _cell(folder: Path, column: str, row: str) -> Path:
+    return folder / f"{column}-{''.join(c if c.isalnum() else '_' for c in row)}.json"
 
 
 def table(name: str, options: Options) -> str:

@@ -24,6 +24,8 @@ from jaxreg.refine.point_to_plane import point_to_plane
 from jaxreg.types import Pair, PointCloud, RigidTransform
 
 Method = Callable[[Pair], RigidTransform]
+Refinement = Callable[[Pair, RigidTransform], RigidTransform]
+"""Better poses of a batch from given ones."""
 
 _TEST, _VALIDATION = 0, 1  # Streams of random keys below the seed of the test pairs.
 
@@ -100,20 +102,28 @@ def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:
 
 
 def evaluate_method(
-    method: Method,
+    method: Callable[..., RigidTransform],
     batches: Iterator[tuple[Pair, int]],
     progress: Callable[[int], None] = lambda done: None,
+    *,
+    initial: RigidTransform | None = None,
 ) -> tuple[RigidTransform, RigidTransform, float]:
     """Predicted and true transforms (numpy, stacked), and the seconds that `method` takes a pair.
 
+    With `initial`, transforms of all pairs, the method (a `refinement`) also gets those of the batch.
     The first batch is registered twice and not timed the first time, since it compiles.
     """
     results, seconds, done = [], 0.0, 0
     for pair, count in batches:
+        inputs = (pair,)
+        if initial is not None:
+            # The last batch is filled up with pairs that are not counted.
+            rows = np.arange(done, done + pair.source.mask.shape[0])
+            inputs = pair, jax.tree.map(lambda x, r=rows: x.take(r, axis=0, mode="clip"), initial)
         if not results:
-            jax.block_until_ready(method(pair))
+            jax.block_until_ready(method(*inputs))
         begin = time.perf_counter()
-        predicted = jax.block_until_ready(method(pair))
+        predicted = jax.block_until_ready(method(*inputs))
         seconds += time.perf_counter() - begin
         done += pair.source.mask.shape[0]
         # Copies: a numpy view would keep the array that it looks at alive on the device.
@@ -157,8 +167,13 @@ def icp_method(pair: Pair) -> RigidTransform:
     return jax.vmap(one)(pair.source, pair.reference)
 
 
-def refined_method(method: Method, config: RefineConfig) -> Method:
-    """`method`, then a refinement of its poses by the ICP family (both clouds, nothing learned)."""
+def refined_method(method: Method, refine: Refinement) -> Method:
+    """`method`, then a refinement of its poses (both clouds, nothing learned)."""
+    return lambda pair: refine(pair, method(pair))
+
+
+def refinement(config: RefineConfig) -> Refinement:
+    """The ICP family from given poses of a batch."""
     options = {
         name: getattr(config, name)
         for name in ("iterations", "max_distance", "trim", "kernel", "anneal", "both_directions")
@@ -177,7 +192,7 @@ def refined_method(method: Method, config: RefineConfig) -> Method:
         return refine(source.points, reference.points, initial=initial, **masks, **options)
 
     refine_batch = jit(jax.vmap(one))
-    return lambda pair: refine_batch(pair.source, pair.reference, method(pair))
+    return lambda pair, initial: refine_batch(pair.source, pair.reference, initial)
 
 
 def host_method(

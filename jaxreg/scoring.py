@@ -112,29 +112,37 @@ def score(
     gicp, with the defaults of `RefineConfig`) improves its poses on the clouds afterwards.
 
     Raises:
-      ValueError: more than one method is chosen, or none; an unknown refinement, or one of given
-        transforms; missing data, weights or files.
+      ValueError: more than one method is chosen, or none; an unknown refinement; missing data,
+        weights or files.
     """
     chosen = [x for x in (checkpoint, predecessor, method, transforms) if x]
-    if len(chosen) > 1 or (transforms and refine) or not (chosen or config.weights):
+    if len(chosen) > 1 or not (chosen or config.weights):
         raise ValueError(
-            "choose one of --checkpoint, --predecessor, --method and --transforms (which takes no "
-            "--refine); without any, "
+            "choose one of --checkpoint, --predecessor, --method and --transforms; without any, "
             "--weights or the configuration must name released weights "
             f"({', '.join(available_weights())})."
         )
+    improve = _refinement(refine)
     count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
-    if transforms:
-        predicted, seconds = _read_transforms(transforms, count), None
+    given = _read_transforms(transforms, count) if transforms else None
+    if given is not None and not refine:
+        predicted, seconds = given, None
         truth = evaluation.true_transforms(batches)
         label = f"transforms of {Path(transforms).name}"
     else:
-        label, function = (
-            (method, choose_method(method)) if method else _network(config, checkpoint, predecessor)
-        )
-        label, function = _refined(label, function, refine)
+        if given is not None:
+            label, function = f"transforms of {Path(transforms).name}", improve
+        elif method:
+            label, function = method, choose_method(method)
+        else:
+            label, function = _network(config, checkpoint, predecessor)
+        if refine and given is None:
+            function = evaluation.refined_method(function, improve)
+        label = f"{label} + {refine}" if refine else label
         with report.counting_progress(count, label) as progress:
-            predicted, truth, seconds = evaluation.evaluate_method(function, batches, progress)
+            predicted, truth, seconds = evaluation.evaluate_method(
+                function, batches, progress, initial=given
+            )
     if save_transforms:
         np.savez(save_transforms, **predicted._asdict())
     figures = metrics.evaluate_transforms(predicted, truth)
@@ -142,12 +150,12 @@ def score(
     return {"method": label, "dataset": dataset} | figures | {"seconds_per_pair": seconds}
 
 
-def _refined(label: str, function: evaluation.Method, refine: str) -> tuple[str, evaluation.Method]:
-    if not refine:
-        return label, function
-    if refine not in _REFINEMENTS:
-        raise ValueError(f"no refinement '{refine}': choose one of {', '.join(_REFINEMENTS)}.")
-    return f"{label} + {refine}", evaluation.refined_method(function, RefineConfig(method=refine))
+def _refinement(name: str) -> evaluation.Refinement | None:
+    if not name:
+        return None
+    if name not in _REFINEMENTS:
+        raise ValueError(f"no refinement '{name}': choose one of {', '.join(_REFINEMENTS)}.")
+    return evaluation.refinement(RefineConfig(method=name))
 
 
 def _read_transforms(path: str, count: int) -> RigidTransform:

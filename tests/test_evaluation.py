@@ -136,7 +136,7 @@ def test_a_refinement_mends_poses_that_are_nearly_right(method, seed):
     def nearly(pair):
         return pair.transform._replace(translation=pair.transform.translation + 0.02)
 
-    refined = evaluation.refined_method(nearly, RefineConfig(method=method))
+    refined = evaluation.refined_method(nearly, evaluation.refinement(RefineConfig(method=method)))
     for function, lowest, highest in ((nearly, 0.01, 0.1), (refined, 0, 1e-5)):
         predicted, truth, _ = evaluation.evaluate_method(function, iter(stream))
         error = np.abs(predicted.translation - truth.translation).max()
