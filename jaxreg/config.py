@@ -73,6 +73,9 @@ class LossConfig:
     """Weight of L_gs, geometric structure consistency."""
     lambda_: float = 1.0
     """Weight of L_sc, spatial consistency."""
+    pose: float = 0.0
+    """Weight of the distances to where the true pose takes the source: no part of the method, which
+    is unsupervised. For pairs that share no point, where the four losses alone hardly move."""
     beta: float = 0.01
     """beta of the Huber function in L_gc, applied to squared distances."""
     l_in: Literal["unsquared", "squared"] = "unsquared"

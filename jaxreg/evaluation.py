@@ -4,7 +4,6 @@ A method is a function of a batch of pairs (a `Pair` with a leading axis on ever
 stacked transforms from source to reference; it must not read `Pair.transform`.
 """
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 
@@ -135,17 +134,31 @@ def evaluate_method(
     return predicted, truth, seconds / done
 
 
-def _register_batch(variables: Variables, pair: Pair, *, config: ModelConfig) -> RigidTransform:
-    one = lambda source, reference: iterate(variables, source, reference, config=config)[0]  # noqa: E731
+def _register_batch(
+    variables: Variables, pair: Pair, *, config: ModelConfig, padded: bool
+) -> RigidTransform:
+    def one(source: PointCloud, reference: PointCloud) -> RigidTransform:
+        if not padded:
+            source, reference = (
+                PointCloud(points, jnp.ones(points.shape[0], bool))
+                for points in (source.points, reference.points)
+            )
+        return iterate(variables, source, reference, config=config)[0]
+
     return jax.vmap(one)(pair.source, pair.reference)
 
 
-_register_batch_jit = jit(_register_batch, static_argnames="config")
+_register_batch_jit = jit(_register_batch, static_argnames=("config", "padded"))
 
 
 def network_method(variables: Variables, config: ModelConfig) -> Method:
-    """The trained network."""
-    return functools.partial(_register_batch_jit, variables, config=config)
+    """The trained network. A batch without padding runs a program of its own, a quarter quicker."""
+
+    def method(pair: Pair) -> RigidTransform:
+        padded = not all(np.all(cloud.mask) for cloud in (pair.source, pair.reference))
+        return _register_batch_jit(variables, pair, config=config, padded=padded)
+
+    return method
 
 
 def identity_method(pair: Pair) -> RigidTransform:

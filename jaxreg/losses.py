@@ -1,6 +1,7 @@
 """The four unsupervised losses of one registration step (Eq. 14-17) and their sum (Eq. 18).
 
-None of them sees the true transform. Sums run over points as in the paper; means over pairs are the
+None of them sees the true transform; `pose_error` does, for pairs that were made and whose pose is
+known, and is no part of the method. Sums run over points as in the paper; means over pairs are the
 caller's, so that the mix of the terms does not depend on the batch.
 """
 
@@ -104,6 +105,13 @@ def spatial_consistency(
     surprise = -jnp.log(jnp.maximum(peak[inliers], jnp.finfo(peak.dtype).tiny))
     count = jnp.sum(valid, dtype=peak.dtype)
     return jnp.sum(jnp.where(valid, surprise, 0)) / jnp.maximum(count, 1)
+
+
+def pose_error(moved: PointCloud, truth: Float[Array, "n 3"]) -> Float[Array, ""]:
+    """How far the source is from where the true pose takes it (`truth`), summed over its points."""
+    # Padding is taken out before the norm: a NaN there would reach the derivative.
+    apart = without_padding(moved.points - truth, moved.mask)
+    return jnp.sum(safe_norm(apart))
 
 
 def step_losses(

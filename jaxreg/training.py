@@ -15,18 +15,18 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from jaxreg import checkpoint, report
+from jaxreg import checkpoint, report, rigid
 from jaxreg.compilation import jit
 from jaxreg.config import Config, PairConfig, TrainConfig
 from jaxreg.data import dataset_label, load_shapes
 from jaxreg.data.pairs import make_pair
 from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
-from jaxreg.losses import LossTerms, step_losses, total_loss
+from jaxreg.losses import pose_error, step_losses, total_loss
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.model import Variables, init_variables, iterate
 from jaxreg.pretrained import save_weights
-from jaxreg.types import Pair
+from jaxreg.types import Pair, PointCloud
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
 
@@ -68,29 +68,35 @@ def create_train_state(config: Config) -> TrainState:
 
 def batch_loss(
     params: Any, statistics: Any, pairs: Pair, *, config: Config
-) -> tuple[Float[Array, ""], tuple[LossTerms, Any]]:
-    """Mean loss of a batch of pairs, its terms, and the updated BatchNorm statistics.
+) -> tuple[Float[Array, ""], tuple[dict[str, Float[Array, ""]], Any]]:
+    """Mean loss of a batch of pairs, its terms by name, and the updated BatchNorm statistics.
 
-    Only the two clouds of each pair are read, never its transform.
+    Only the two clouds of each pair are read, and never its transform, unless `config.loss.pose`
+    asks for it.
     """
 
-    def pair_loss(source, reference):
+    def pair_loss(source, reference, truth):
         variables = {"params": params, "batch_stats": statistics}
-        _, terms, variables = iterate(
-            variables,
-            source,
-            reference,
-            config=config.model,
-            train=True,
-            observe=lambda step, graph: step_losses(
+        target = rigid.apply(truth, source.points) if config.loss.pose else None
+
+        def observe(step, graph):
+            terms = step_losses(
                 step, graph, source.mask, reference, config=config.loss, model=config.model
-            ),
+            )
+            if target is None:
+                return terms, {}
+            return terms, {"pose_error": pose_error(PointCloud(step.moved, source.mask), target)}
+
+        _, seen, variables = iterate(
+            variables, source, reference, config=config.model, train=True, observe=observe
         )
-        terms = jax.tree.map(jnp.sum, terms)
-        return total_loss(terms, config.loss), terms, variables["batch_stats"]
+        terms, posed = jax.tree.map(jnp.sum, seen)
+        loss = total_loss(terms, config.loss)
+        loss = loss + sum(config.loss.pose * error for error in posed.values())
+        return loss, terms._asdict() | posed, variables["batch_stats"]
 
     loss, terms, statistics = jax.vmap(pair_loss, axis_name=BATCH_AXIS, out_axes=(0, 0, None))(
-        pairs.source, pairs.reference
+        pairs.source, pairs.reference, pairs.transform
     )
     return jnp.mean(loss), (jax.tree.map(jnp.mean, terms), statistics)
 
@@ -118,7 +124,7 @@ def train_step(
     # A young average follows faster, so that it does not remember the initial weights for long.
     decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
     average = optax.incremental_update(variables, state.average, 1 - decay)
-    logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms._asdict()}
+    logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms}
     return TrainState(state.step + 1, variables, average, optimizer), logged
 
 

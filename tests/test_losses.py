@@ -218,3 +218,17 @@ def test_dtypes_are_kept(rng, dtype):
     reference = PointCloud(rng.uniform(-1, 1, (M, 3)).astype(dtype), np.ones(M, bool))
     terms = step_losses(LossConfig(), MODEL)(step, np.ones(N, bool), reference)
     assert {x.dtype for x in terms} == {jnp.dtype(dtype)}
+
+
+def test_pose_error_is_the_sum_of_distances_of_valid_points(rng):
+    moved, truth = rng.normal(size=(2, 9, 3))
+    mask = np.arange(9) < 6
+    expected = sum(np.linalg.norm(a - b) for a, b in zip(moved[:6], truth[:6], strict=True))
+    holed = np.where(mask[:, None], moved, np.nan)
+    value, gradient = jax.value_and_grad(
+        lambda x: losses.pose_error(PointCloud(x, jnp.asarray(mask)), jnp.asarray(truth))
+    )(jnp.asarray(holed))
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(np.linalg.norm(gradient[:6], axis=1), 1, rtol=1e-12)
+    assert jnp.all(gradient[6:] == 0)

@@ -54,6 +54,26 @@ def test_the_true_transform_changes_no_gradient(config, seed):
     jax.tree.map(np.testing.assert_array_equal, honest, lied)
 
 
+def test_the_pose_loss_reads_the_true_transform_and_nothing_else_changes(config, seed):
+    posed = dataclasses.replace(config, loss=dataclasses.replace(config.loss, pose=2.0))
+    shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
+    pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
+    state = training.create_train_state(config)
+    arguments = state.variables["params"], state.variables["batch_stats"], pairs
+    loss, (terms, _) = jax.jit(functools.partial(training.batch_loss, config=config))(*arguments)
+    total, (more, _) = jax.jit(functools.partial(training.batch_loss, config=posed))(*arguments)
+    error = more.pop("pose_error")
+    assert set(terms) == set(more)
+    np.testing.assert_allclose(total, loss + 2 * error, rtol=1e-5)
+    # Where the true pose is a thousand away from any other, every point of every step is.
+    far = pairs.transform._replace(translation=pairs.transform.translation + 1000.0)
+    lied = (*arguments[:2], pairs._replace(transform=far))
+    _, (away, _) = jax.jit(functools.partial(training.batch_loss, config=posed))(*lied)
+    steps, points = config.model.iterations, config.pairs.kept
+    np.testing.assert_allclose(away["pose_error"], steps * points * 1000 * 3**0.5, rtol=0.01)
+    assert error < away["pose_error"] / 100
+
+
 def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     """A law of gradients: a short enough step along minus the gradient lowers the loss."""
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))

@@ -218,6 +218,11 @@ def core_rows() -> dict[str, Row]:
             (RNG.uniform(0.1, 1, N), inlier_idx, valid),
             ((np.zeros(N), inlier_idx, valid), (np.ones(N), inlier_idx, ~valid)),
         ),
+        "losses.pose_error": Row(
+            losses.pose_error,
+            (everything(points()), points()),
+            every(lambda x: (everything(x), x)),
+        ),
         "losses.total_loss": Row(
             functools.partial(losses.total_loss, config=LossConfig()),
             (losses.LossTerms(*RNG.uniform(size=(4, 2))),),
