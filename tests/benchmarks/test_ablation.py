@@ -10,10 +10,12 @@ from benchmarks import ablation, tables
 from jaxreg.config import to_dict
 
 
+@pytest.mark.parametrize("protocol", ablation.PROTOCOLS)
 @pytest.mark.parametrize("row", ablation.ROWS)
-def test_a_row_differs_from_the_full_method_in_its_own_fields(row):
+def test_a_row_differs_from_the_full_method_in_its_own_fields(row, protocol):
     full, other = (
-        flatten_dict(to_dict(ablation.row_config(name, 2, 50)), sep=".") for name in ("full", row)
+        flatten_dict(to_dict(ablation.row_config(name, 2, 50, protocol)), sep=".")
+        for name in ("full", row)
     )
     assert {key for key in full if full[key] != other[key]} == set(ablation.ROWS[row])
     assert (other["train.seed"], other["train.steps"]) == (2, 50)
@@ -21,7 +23,9 @@ def test_a_row_differs_from_the_full_method_in_its_own_fields(row):
 
 def test_the_table_has_the_mean_and_the_range_of_the_seeds(tmp_path):
     for seed, error in enumerate((0.1, 0.2, 0.6)):
-        figures = {name: dict.fromkeys(ablation.FIGURES, error) for name in ablation.COLUMNS}
+        figures = {
+            name: dict.fromkeys(ablation.FIGURES["copies"], error) for name in ablation.COLUMNS
+        }
         record = {"row": "without L_in", "seed": seed, "figures": figures}
         (tmp_path / f"x-{seed}.json").write_text(json.dumps(record))
     *_, line = ablation.table(ablation.Options(workdir=str(tmp_path))).splitlines()
