@@ -97,7 +97,9 @@ def draw_pairs(registered: list[Registered], names: list[str], path: Path, title
             [reference, (item.aligned, to_rgb(pictures.ALIGNED))],
             [(item.aligned, colors)],
         )
-        everything = np.concatenate([item.pair.source.points, item.pair.reference.points])
+        everything = np.concatenate(
+            [item.pair.source.points, item.pair.reference.points, item.aligned]
+        )
         for axes, clouds in zip(row, panels, strict=True):
             pictures.draw_clouds(axes, clouds, VIEW, pictures.project(everything, VIEW))
         row[0].set_title(f"{name}: before", fontsize=10)

@@ -51,6 +51,20 @@ def test_refined_transforms_of_another_program_are_those_of_the_refined_method(c
     assert {name: ours[name] for name in metrics} == {name: theirs[name] for name in metrics}
 
 
+@pytest.mark.parametrize("refine", ["icp", "point_to_plane", "gicp"])
+def test_refinement_leaves_a_right_pose_where_it_is(config, tmp_path, refine):
+    """Of partial copies: what has no counterpart must not draw the pose away."""
+    partial = dataclasses.replace(
+        config,
+        data=dataclasses.replace(config.data, test_shapes=12),
+        test_pairs=PairConfig(points=256, kept=192),
+    )
+    truth = scoring.evaluation.true_transforms(scoring.pair_stream(partial, root=None)[1])
+    np.savez(tmp_path / "true.npz", **truth._asdict())
+    found = scoring.score(partial, transforms=str(tmp_path / "true.npz"), refine=refine)
+    assert found["worst_rre_deg"] < 0.01
+
+
 def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
     _, stream = scoring.pair_stream(config, root=None, batch=2)
     scoring.save_pairs(str(tmp_path / "pairs.npz"), stream)
