@@ -50,8 +50,13 @@ def moment_descriptors(
     squared = squared_distances(points, points)
     normals = _normals(points, squared, valid, normal_radius)
     table = jnp.concatenate([points, _outer(points), _outer(normals)], axis=1)
-    blocks = [_at_scale(points, normals, squared, table, valid, radius) for radius in radii]
-    return Descriptors(jnp.concatenate(blocks, axis=1), normals)
+    # In a loop, one scale after the other: from some 1500 points on, the products and eigenvalues of
+    # all scales at once wait for each other forever on two cores (XLA's thread pool, jaxlib 0.10.2).
+    blocks = jax.lax.map(
+        lambda radius: _at_scale(points, normals, squared, table, valid, radius),
+        jnp.asarray(radii, points.dtype),
+    )
+    return Descriptors(jnp.concatenate(list(blocks), axis=1), normals)
 
 
 def standardized(
@@ -96,7 +101,7 @@ def openness(
 
 
 def _at_scale(
-    points: Array, normals: Array, squared: Array, table: Array, valid: Array, radius: float
+    points: Array, normals: Array, squared: Array, table: Array, valid: Array, radius: Array
 ) -> Array:
     means = _means(squared, table, valid, radius)
     offset = means[:, :3] - points
@@ -123,14 +128,14 @@ def _at_scale(
     )
 
 
-def _normals(points: Array, squared: Array, valid: Array, radius: float) -> Array:
+def _normals(points: Array, squared: Array, valid: Array, radius: Array | float) -> Array:
     table = jnp.concatenate([points, _outer(points)], axis=1)
     means = _means(squared, table, valid, radius)
     spread = means[:, 3:].reshape(-1, 3, 3) - means[:, :3, None] * means[:, None, :3]
     return jnp.where(valid[:, None], jnp.linalg.eigh(spread)[1][:, :, 0], 0)
 
 
-def _means(squared: Array, table: Array, valid: Array, radius: float) -> Array:
+def _means(squared: Array, table: Array, valid: Array, radius: Array | float) -> Array:
     """Gaussian-weighted mean of the rows of `table` around every point."""
     weights = jnp.where(valid[None, :], jnp.exp(-squared / (2 * (radius / 2) ** 2)), 0)
     total = jnp.maximum(jnp.sum(weights, axis=1, keepdims=True), _SMALLEST_NORM)
