@@ -197,14 +197,14 @@ def _screened(
     score = jnp.where(_turns_less(poses, largest_angle), score, -5)
     if also is not None:
         score = score.at[0].set(5)
-    chosen = pick_distinct(
-        poses,
-        score,
-        count=min(config.screened, len(score)),
-        angle=config.distinct_angle,
-        distance=config.distinct_distance,
+    return _distinct_best(
+        poses, score, config.screened, config.distinct_angle, config.distinct_distance
     )
-    return best_of(poses, chosen)
+
+
+def _distinct_best(poses, score: Array, most: int, angle: float, distance: float) -> RigidTransform:
+    count = min(most, len(score))
+    return best_of(poses, pick_distinct(poses, score, count=count, angle=angle, distance=distance))
 
 
 def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:
@@ -234,15 +234,13 @@ def _shortlist(
             rim=config.rim,
         )
     )(poses)
-    score = _score(found, config)
-    chosen = pick_distinct(
+    return _distinct_best(
         poses,
-        score,
-        count=min(config.aligned, len(score)),
-        angle=config.aligned_angle,
-        distance=config.aligned_distance,
+        _score(found, config),
+        config.aligned,
+        config.aligned_angle,
+        config.aligned_distance,
     )
-    return best_of(poses, chosen)
 
 
 def _ranked(
