@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
-from jaxreg import rigid
+from jaxreg import rigid, symmetric
 from jaxreg.dense.nearest import NearestGrid, lookup, nearest_packed
 from jaxreg.dense.surface import Surface
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import inverse_symmetric, plane_covariances
+from jaxreg.refine.normals import plane_covariances
 from jaxreg.types import RigidTransform
 
 
@@ -74,7 +74,7 @@ def align_fine(
         i, j = jnp.concatenate([rows, backward]), jnp.concatenate([forward, columns])
         turned = jnp.matmul(pose.rotation, covariances, precision=Precision.HIGHEST)
         turned = jnp.matmul(turned, pose.rotation.T, precision=Precision.HIGHEST)
-        metric = 2 * thickness * inverse_symmetric(turned[i] + others[j])
+        metric = 2 * thickness * symmetric.inverse(turned[i] + others[j])
         residual = moved[i] - reference.points[j]
         weight = jnp.where(valid, _closeness(residual, width), 0)
         weighted = weight[:, None, None] * metric

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
-from jaxreg import rigid
+from jaxreg import rigid, symmetric
 from jaxreg.config import RefineConfig
 from jaxreg.neighbors import knn
 from jaxreg.refine import frame
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import inverse_symmetric, normals, plane_covariances
+from jaxreg.refine.normals import normals, plane_covariances
 from jaxreg.refine.pairing import (
     Kernel,
     Pairs,
@@ -111,7 +111,7 @@ def gicp_step(
     # Padding may hold NaN covariances; its pairs count for nothing.
     identity = jnp.eye(3, dtype=combined.dtype)[None]
     combined = jnp.where(pairs.mask[:, None, None], combined, identity)
-    metric = 2 * thickness * inverse_symmetric(combined)
+    metric = 2 * thickness * symmetric.inverse(combined)
     residual = moved - target
     energy = jnp.sum(residual * jnp.matmul(metric, residual[..., None])[..., 0], axis=-1)
     distance = jnp.sum(residual**2, axis=-1)

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,3 +92,19 @@ def test_derivatives_are_finite_and_do_not_see_padding(seed):
     assert np.isfinite(gradient).all()
     assert np.any(gradient[:380] != 0)
     assert np.all(gradient[380:] == 0)
+
+
+def test_large_clouds_end():
+    """With LAPACK's eigenvectors of every point the second call waited forever on two cores.
+
+    In a process of its own, which can be ended.
+    """
+    program = (
+        "import jax, numpy as np; from jaxreg.dense import register_dense;"
+        "rng = np.random.default_rng(0); run = jax.jit(register_dense);"
+        "clouds = [rng.normal(size=(1536, 3)).astype(np.float32) for _ in range(5)];"
+        "print(sum(bool(run(x, y).valid) for x, y in zip(clouds, clouds[1:])))"
+    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=True)
+    assert done.stdout.strip() == "4"

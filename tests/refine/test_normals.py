@@ -7,7 +7,6 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxreg.refine.normals import (
-    inverse_symmetric,
     plane_covariances,
     smallest_eigenvector,
 )
@@ -47,12 +46,6 @@ def test_plane_covariances_have_the_given_thickness(seed):
     np.testing.assert_allclose(result @ normal, 1e-3 * normal, atol=1e-15)
     np.testing.assert_allclose(np.linalg.eigvalsh(result), [1e-3, 1, 1])
     np.testing.assert_array_equal(plane_covariances(jnp.zeros((1, 3)), 1e-3)[0], np.eye(3))
-
-
-def test_inverse_of_symmetric_matrices(seed):
-    root = np.random.default_rng(seed).normal(size=(5, 3, 3))
-    matrix = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
-    np.testing.assert_allclose(inverse_symmetric(jnp.asarray(matrix)), np.linalg.inv(matrix))
 
 
 def test_derivative_equals_finite_differences(seed):

@@ -16,6 +16,7 @@ from jaxreg import (
     numerics,
     procrustes,
     rigid,
+    symmetric,
 )
 from jaxreg.config import LossConfig
 from jaxreg.types import RigidTransform
@@ -52,6 +53,7 @@ def core_rows() -> dict[str, Row]:
     part = np.arange(N) < 5
     u = np.array([0.5, -1.0, 2.0])
     zero3 = np.zeros(3)
+    tilted = np.diag([1.0, 2.0, 4.0]) + 0.1 * np.ones((3, 3))
     scores = RNG.uniform(0.1, 1, (N, N))
     huber = functools.partial(losses.huber, beta=0.5)
     structure = functools.partial(invariants.geometric_structure, edge="vector", angles="all")
@@ -73,6 +75,12 @@ def core_rows() -> dict[str, Row]:
             (points(), points()),
             ((u, u), (u, -u), (u, zero3), (zero3, u), (zero3, zero3), (u, 1e-9 * u)),
         ),
+        "symmetric.eigh": Row(
+            lambda m: (symmetric.eigh(m).values, jnp.abs(symmetric.eigh(m).vectors)),
+            (tilted,),
+            tuple((m,) for m in (np.zeros((3, 3)), np.eye(3), np.ones((3, 3)))),
+        ),
+        "symmetric.inverse": Row(symmetric.inverse, (tilted,)),
         "rigid.identity": Row(lambda: rigid.identity(jnp.float64), ()),
         "rigid.apply": Row(rigid.apply, (pose(), points()), ((nowhere(), np.zeros((N, 3))),)),
         "rigid.compose": Row(rigid.compose, (pose(), pose()), ((nowhere(), nowhere()),)),

@@ -100,7 +100,6 @@ def small_parts() -> dict[str, Row]:
             (np.diag([1.0, 2.0, 4.0]) + 0.1 * np.ones((3, 3)),),
             ((np.zeros((3, 3)),), (np.eye(3),), (np.diag([1.0, 1.0, 2.0]),), (np.ones((3, 3)),)),
         ),
-        "normals.inverse_symmetric": Row(normals.inverse_symmetric, (definite(),)),
         "pairing.closest_pairs": Row(
             closest, (points(), points(5)), every(lambda x: (x, x)), smooth=False
         ),
