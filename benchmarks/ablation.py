@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import tyro
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -143,6 +144,8 @@ def run(row: str, seed: int, options: Options, root: Path | None) -> None:
         "figures": evaluate(workdir, root, options.pairs, options.protocol),
     }
     record.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    # Programs of some twenty runs fill the table of memory maps of a process, and LLVM ends it.
+    jax.clear_caches()
 
 
 def table(options: Options) -> str:

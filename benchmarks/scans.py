@@ -78,7 +78,7 @@ def ours(rotation: str) -> Callable:
 
 
 def described(x: np.ndarray, y: np.ndarray):
-    """Both clouds reduced to voxels, with normals, and their FPFH, as in Open3D's tutorial."""
+    """Both clouds reduced to voxels, with normals to the inside, and FPFH, as in Open3D's tutorial."""
     import open3d as o3d
 
     clouds, features = [], []
@@ -86,6 +86,8 @@ def described(x: np.ndarray, y: np.ndarray):
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
         cloud = cloud.voxel_down_sample(VOXEL)
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * VOXEL, 30))
+        # To one side that turns along with the cloud; see jaxreg.classical.open3d_baselines.
+        cloud.orient_normals_towards_camera_location(cloud.get_center())
         around = o3d.geometry.KDTreeSearchParamHybrid(5 * VOXEL, 100)
         features.append(o3d.pipelines.registration.compute_fpfh_feature(cloud, around))
         clouds.append(cloud)

@@ -3,6 +3,7 @@
 All lengths derive from one, `spacing`, the distance between neighbours: normals within 2 of
 it, FPFH within 5, RANSAC inliers within 1.5 and FGR inliers within 0.5 (the ratios of Open3D's
 tutorial to its voxel size), ICP pairs within 10. The default suits 1024 points on a unit sphere.
+Normals point away from the centre of the cloud.
 
 `icp`, `icp_point_to_plane`, `fgr` and `fpfh_ransac` are the rows that papers print. The others add
 what their authors recommend: a refinement, within 2 and then 0.6 (FGR, RANSAC) of `spacing`.
@@ -157,6 +158,10 @@ def _cloud(points: np.ndarray, name: str, spacing: float) -> Any:
     cloud.estimate_normals(
         open3d.geometry.KDTreeSearchParamHybrid(radius=2 * spacing, max_nn=_NORMAL_NEIGHBORS)
     )
+    # FPFH depends on the side that a normal points to, and Open3D leaves that to the axes: turned by
+    # any rotation, half of the normals change sides. Away from the centre is a side that turns along.
+    cloud.orient_normals_towards_camera_location(cloud.get_center())
+    cloud.normals = open3d.utility.Vector3dVector(-np.asarray(cloud.normals))
     return cloud
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.classical import choose
+from jaxreg.classical import choose, open3d_baselines
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.types import RigidTransform
 
@@ -53,6 +53,17 @@ def test_global_methods_find_a_large_motion(name, seed):
     if name in REFINED:
         assert result["mie_r_deg"] < 0.05
         assert result["mie_t"] < 0.001
+
+
+def test_normals_turn_with_the_cloud(seed):
+    """Else FPFH would describe the same surface in two ways."""
+    source, _, _ = make_pair(seed, 0)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    normals, turned = (
+        np.asarray(open3d_baselines._cloud(x, "source", 0.1).normals)
+        for x in (source, source @ rotation.T)
+    )
+    np.testing.assert_allclose(turned, normals @ rotation.T, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", LOCAL + GLOBAL + REFINED)
