@@ -7,8 +7,8 @@ this is what a first port costs (`benchmarks/speed.py`), and since it shares no 
 library it is what the library's results and gradients are held to
 (`tests/benchmarks/test_transcription.py`).
 
-The readings are the library's defaults: `gather` for the 1-NN patch, edge vectors, all angles, the
-top N_c in the Procrustes. Parameters are those of the released weights.
+The readings are those of the released weights: `gather` for the 1-NN patch, edge vectors, all angles, the
+top N_c in the Procrustes. So are the parameters.
 """
 
 from typing import Any, NamedTuple
