@@ -19,7 +19,7 @@ from tests import oracles
 from tests.compiled import knn
 
 N, M, K, N_C, BETA = 14, 17, 3, 6, 0.01
-MODEL = ModelConfig(k=K, k_matching=K, n_inliers=N_C)
+MODEL = ModelConfig(k=K, k_matching=K, angles="all", n_inliers=N_C)
 
 
 @pytest.fixture

@@ -19,7 +19,14 @@ from jaxreg.types import Pair, PointCloud, RigidTransform
 pytestmark = pytest.mark.loose
 
 SMALL = ModelConfig(
-    k=4, k_matching=3, channels=(8, 16), width=16, inlier_width=4, n_inliers=12, iterations=2
+    k=4,
+    k_matching=3,
+    channels=(8, 16),
+    width=16,
+    angles="all",
+    inlier_width=4,
+    n_inliers=12,
+    iterations=2,
 )
 
 
