@@ -183,13 +183,17 @@ def init_network(key: jax.Array, inputs: int) -> dict[str, jax.Array]:
 def network_score(weights: dict, there: jax.Array, back: jax.Array, _terms=None) -> jax.Array:
     """A score of every pose from the facts (poses, points, 17) of both clouds."""
 
+    def layer(x, name):
+        bias = weights[f"{name}_bias"]
+        x = x @ weights[name] + jnp.broadcast_to(bias, (*x.shape[:-1], len(bias)))
+        return jax.nn.gelu(x)
+
     def pooled(x):
-        x = jax.nn.gelu(jnp.float32(x) @ weights["lift"] + weights["lift_bias"])
-        return jnp.mean(jax.nn.gelu(x @ weights["mix"] + weights["mix_bias"]), axis=-2)
+        return jnp.mean(layer(layer(jnp.float32(x), "lift"), "mix"), axis=-2)
 
     one, other = pooled(there), pooled(back)
     joined = 4 * jnp.concatenate([one + other, jnp.abs(one - other)], axis=-1)
-    return jax.nn.gelu(joined @ weights["join"] + weights["join_bias"]) @ weights["last"]
+    return layer(joined, "join") @ weights["last"]
 
 
 def terms_score(weights: jax.Array, _there, _back, terms: jax.Array) -> jax.Array:
