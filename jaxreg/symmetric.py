@@ -35,17 +35,18 @@ def eigh(matrix: Float[Array, "*n 3 3"]) -> Eigen:
     matrix = (matrix + matrix.mT) / 2
     largest = jnp.max(jnp.abs(matrix), axis=(-2, -1))
     scale = jnp.where(largest > 0, largest, 1)
-    entries = {(p, q): matrix[..., p, q] / scale for p in range(3) for q in range(p, 3)}
-    one, zero = jnp.ones_like(scale), jnp.zeros_like(scale)
-    columns = [[one if k == axis else zero for axis in range(3)] for k in range(3)]
-    entries, columns = jax.lax.fori_loop(
-        0, _SWEEPS, lambda _, state: _sweep(*state), (entries, columns)
-    )
-    pairs = [(entries[k, k] * scale, columns[k]) for k in range(3)]
+    # An axis in front, over which the components of a column are spread.
+    entry = lambda p, q: (matrix[..., p, q] / scale)[None]  # noqa: E731
+    diagonal, off = (tuple(entry(k, (k + d) % 3) for k in range(3)) for d in (0, 1))
+    unit = jnp.eye(3, dtype=matrix.dtype)
+    shape = (3, *scale.shape)
+    columns = tuple(jnp.broadcast_to(jnp.expand_dims(e, range(1, len(shape))), shape) for e in unit)
+    state = jax.lax.fori_loop(0, 3 * _SWEEPS, _rotate, (diagonal, off, columns))
+    pairs = list(zip(state[0], state[2], strict=True))
     for lower, upper in ((0, 1), (1, 2), (0, 1)):
         pairs[lower], pairs[upper] = _ascending(pairs[lower], pairs[upper])
-    vectors = [jnp.stack(column, axis=-1) for _, column in pairs]
-    return Eigen(jnp.stack([value for value, _ in pairs], axis=-1), jnp.stack(vectors, axis=-1))
+    values, vectors = (jnp.stack(x, axis=-1) for x in zip(*pairs, strict=True))
+    return Eigen(values[0] * scale[..., None], jnp.moveaxis(vectors, 0, -2))
 
 
 @eigh.defjvp
@@ -73,27 +74,22 @@ def _product(a: Array, b: Array) -> Array:
     return jnp.matmul(a, b, precision=Precision.HIGHEST)
 
 
-def _sweep(entries: dict, columns: list) -> tuple[dict, list]:
-    """One rotation in each coordinate plane; each makes one entry off the diagonal zero."""
-    entries, columns = dict(entries), list(columns)
-    for p, q in ((0, 1), (0, 2), (1, 2)):
-        off, difference = entries[p, q], entries[q, q] - entries[p, p]
-        # The smaller root of t^2 + t difference / off - 1, without a division by `off`.
-        root = jnp.abs(difference) + jnp.sqrt(difference**2 + 4 * off**2)
-        sign = jnp.where(difference < 0, -1, 1)
-        tangent = jnp.where(root > 0, 2 * sign * off / jnp.where(root > 0, root, 1), 0)
-        cosine = jax.lax.rsqrt(1 + tangent**2)
-        sine = tangent * cosine
-        rotate = lambda x, y, c=cosine, s=sine: (c * x - s * y, s * x + c * y)  # noqa: E731
-        entries[p, p] = entries[p, p] - tangent * off
-        entries[q, q] = entries[q, q] + tangent * off
-        entries[p, q] = jnp.zeros_like(off)
-        third = 3 - p - q
-        with_p, with_q = tuple(sorted((p, third))), tuple(sorted((q, third)))
-        entries[with_p], entries[with_q] = rotate(entries[with_p], entries[with_q])
-        turned = [rotate(x, y) for x, y in zip(columns[p], columns[q], strict=True)]
-        columns[p], columns[q] = [x for x, _ in turned], [y for _, y in turned]
-    return entries, columns
+def _rotate(_, state: tuple) -> tuple:
+    """The rotation that makes the first entry beside the diagonal zero; then the axes take turns.
+
+    `off` are the entries (0, 1), (1, 2) and (2, 0). Three rotations are a sweep, and put every axis
+    back into its place. (One rotation at a time is a third of the program to trace and compile.)
+    """
+    (a, b, c), (ab, bc, ca), (u, v, w) = state
+    # The smaller root of t^2 + t (b - a) / ab - 1, without a division by `ab`.
+    root = jnp.abs(b - a) + jnp.sqrt((b - a) ** 2 + 4 * ab**2)
+    sign = jnp.where(b < a, -1, 1)
+    tangent = jnp.where(root > 0, 2 * sign * ab / jnp.where(root > 0, root, 1), 0)
+    cosine = jax.lax.rsqrt(1 + tangent**2)
+    sine = tangent * cosine
+    turned = lambda x, y: (cosine * x - sine * y, sine * x + cosine * y)  # noqa: E731
+    (ca, bc), (u, v) = turned(ca, bc), turned(u, v)
+    return (b + tangent * ab, c, a - tangent * ab), (bc, ca, jnp.zeros_like(ab)), (v, w, u)
 
 
 def _ascending(one: tuple, other: tuple) -> tuple[tuple, tuple]:
