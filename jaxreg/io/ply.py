@@ -23,13 +23,17 @@ def read(path: Path) -> np.ndarray:
 
 def _open(path: Path) -> PlyData:
     try:
-        # Without a memory map a file can be written again under its own name.
-        return PlyData.read(str(path), mmap=False)
+        # Mapped, since plyfile reads row by row otherwise: 0.3 s for 50,000 points instead of 0.01.
+        data = PlyData.read(str(path), mmap="c")
     except PlyParseError as error:
         # plyfile says which element and row, or which line of the header.
         raise ValueError(f"malformed or truncated PLY ({error})") from None
     except UnicodeDecodeError:
         raise ValueError("the header is not ascii text") from None
+    for element in data.elements:
+        # A copy, so that the file can be written again under its own name.
+        element.data = np.array(element.data)
+    return data
 
 
 def write(path: Path, points: np.ndarray) -> None:
