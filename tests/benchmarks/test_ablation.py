@@ -17,7 +17,11 @@ def test_a_row_differs_from_the_full_method_in_its_own_fields(row, protocol):
         flatten_dict(to_dict(ablation.row_config(name, 2, 50, protocol)), sep=".")
         for name in ("full", row)
     )
-    assert {key for key in full if full[key] != other[key]} == set(ablation.ROWS[row])
+    # Known poses alone leave the other losses out already: a row cannot leave them out again.
+    already = {key for key, value in ablation.ROWS[row].items() if full[key] == value}
+    assert protocol == "posed" or not already
+    changed = {key for key in full if full[key] != other[key]}
+    assert changed == set(ablation.ROWS[row]) - already
     assert (other["train.seed"], other["train.steps"]) == (2, 50)
 
 

@@ -31,6 +31,7 @@ HALVES = {"matching.gather_rows", "matching.collect_rows"}
 """Of `neighborhood_sum` and of its transpose, which knows one as the derivative of the other."""
 ROOMS = (
     "numerics",
+    "symmetric",
     "rigid",
     "neighbors",
     "procrustes",
