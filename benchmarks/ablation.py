@@ -63,17 +63,16 @@ ROWS: dict[str, dict[str, Any]] = {
         "loss.l_sc": "F",
     },
 }
+_RESAMPLED = {
+    "pairs.sampling": "disjoint",
+    "test_pairs.sampling": "disjoint",
+    "loss.pose": 1.0,
+}
 PROTOCOLS: dict[str, dict[str, Any]] = {
     "copies": {},
-    "resampled": {
-        "pairs.sampling": "disjoint",
-        "test_pairs.sampling": "disjoint",
-        "loss.pose": 1.0,
-    },
-    "posed": {
-        "pairs.sampling": "disjoint",
-        "test_pairs.sampling": "disjoint",
-        "loss.pose": 1.0,
+    "resampled": _RESAMPLED,
+    "posed": _RESAMPLED
+    | {
         "loss.global_consistency": 0.0,
         "loss.gamma": 0.0,
         "loss.rho": 0.0,

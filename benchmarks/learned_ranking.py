@@ -26,14 +26,13 @@ import optax
 import tyro
 
 from benchmarks import protocols
-from jaxreg import compilation, rigid
+from jaxreg import compilation
 from jaxreg.config import DenseConfig, load_config
 from jaxreg.data import data_root, modelnet, shapes
-from jaxreg.dense.moments import moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import nearest_packed
-from jaxreg.dense.register import search_dense
+from jaxreg.dense.register import search_dense, surfaces
 from jaxreg.dense.surface import Surface
-from jaxreg.dense.verification import evidence
+from jaxreg.dense.verification import evidence, move
 from jaxreg.metrics import pair_errors
 from jaxreg.types import Pair, RigidTransform
 
@@ -65,19 +64,6 @@ class Choice(NamedTuple):
     right: np.ndarray
 
 
-def surface(points: jax.Array, other: jax.Array, config: DenseConfig) -> Surface:
-    """The points with normals, openness and local features, as the search has them."""
-    mine, others = (
-        moment_descriptors(x, radii=config.radii, normal_radius=config.normal_radius)
-        for x in (points, other)
-    )
-    local = mine.features.shape[1] // len(config.radii)
-    features, _ = standardized(mine.features[:, :local], others.features[:, :local])
-    mask = jnp.ones(len(points), bool)
-    opened = openness(points, mine.normals, mask, radius=config.rim_radius)
-    return Surface(points, mine.normals, opened, features, mask)
-
-
 def facts(moved: Surface, other: Surface) -> jax.Array:
     """Seventeen numbers of every point, from where it lies to the nearest point of the other."""
     nearest = nearest_packed(moved.points, other.points, other.mask)
@@ -103,12 +89,10 @@ def choices(options: Options):
 
     def found(x: jax.Array, y: jax.Array):
         search = search_dense(x, y, config=config)
-        source, reference = surface(x, y, config), surface(y, x, config)
+        source, reference, _ = surfaces(x, y, None, None, config)
 
         def judge(pose: RigidTransform):
-            moved = source._replace(
-                points=rigid.apply(pose, x), normals=source.normals @ pose.rotation.T
-            )
+            moved = move(pose, source)
             terms = evidence(
                 pose,
                 source,

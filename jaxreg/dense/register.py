@@ -100,7 +100,7 @@ def _enter(source, reference, source_mask, reference_mask, config: DenseConfig):
     return where, x * factor, y * factor
 
 
-def _surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
+def surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
     """Both clouds with normals, rims and local features, and the cosines of all their features."""
     masks = [
         jnp.ones(points.shape[0], bool) if mask is None else mask
@@ -130,7 +130,7 @@ def _search(
     x, y, source_mask, reference_mask, config: DenseConfig, also=None, largest_angle=math.pi
 ) -> Search:
     x, y = jax.lax.stop_gradient((x, y))
-    source, reference, similarity = _surfaces(x, y, source_mask, reference_mask, config)
+    source, reference, similarity = surfaces(x, y, source_mask, reference_mask, config)
     poses = _hypotheses(source, reference, similarity, config)
     grids = [
         nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)

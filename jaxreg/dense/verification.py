@@ -50,7 +50,7 @@ def evidence(
     E[k exp(-h^2 / 2 plane_width^2) c^2]``, ``alike = E[k s]``, ``within = E[k i i']``, ``beside =
     E[i']`` over the points with d between 1.5 and 3 `width` (0 for the others).
     """
-    moved = _moved(pose, source)
+    moved = move(pose, source)
     forward = nearest_packed(moved.points, reference.points, reference.mask)
     backward = nearest_packed(reference.points, moved.points, source.mask)
     there = _one_way(moved, reference, forward, width, plane_width, rim)
@@ -74,8 +74,8 @@ def evidence_by_grid(
 
     A look-up in place of a search, so much faster: enough to drop poses that are far from the best.
     """
-    moved = _moved(pose, thinned(source, step))
-    back = _moved(rigid.inverse(pose), thinned(reference, step))
+    moved = move(pose, thinned(source, step))
+    back = move(rigid.inverse(pose), thinned(reference, step))
     forward = lookup(reference_grid, moved.points)
     backward = lookup(source_grid, back.points)
     there = _one_way(moved, reference, forward, width, plane_width, rim)
@@ -83,7 +83,8 @@ def evidence_by_grid(
     return Evidence(*(a + b for a, b in zip(there, back, strict=True)))
 
 
-def _moved(pose: RigidTransform, surface: Surface) -> Surface:
+def move(pose: RigidTransform, surface: Surface) -> Surface:
+    """The surface under a pose: points moved, normals turned."""
     return surface._replace(
         points=rigid.apply(pose, surface.points),
         normals=jnp.matmul(surface.normals, pose.rotation.T, precision=Precision.HIGHEST),

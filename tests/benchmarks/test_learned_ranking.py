@@ -7,14 +7,15 @@ import pytest
 
 from benchmarks import learned_ranking as ranking
 from jaxreg.config import DenseConfig
+from jaxreg.dense.register import surfaces
 
 pytestmark = pytest.mark.loose
 
 
 def test_facts_of_a_cloud_on_itself(seed):
     points = jnp.asarray(np.random.default_rng(seed).normal(size=(40, 3)))
-    surface = jax.jit(lambda x: ranking.surface(x, x, DenseConfig()))(points)
-    facts = np.asarray(ranking.facts(surface, surface))
+    surface, other, _ = jax.jit(lambda x: surfaces(x, x, None, None, DenseConfig()))(points)
+    facts = np.asarray(ranking.facts(surface, other))
     assert facts.shape == (40, 17)
     np.testing.assert_allclose(facts[:, :10], 1, atol=1e-6)  # near, on the plane, facing, alike
     np.testing.assert_allclose(facts[:, -1], 0, atol=1e-6)  # the distance
