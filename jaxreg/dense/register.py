@@ -1,5 +1,6 @@
 """The dense path from two clouds to a pose; jit, vmap and grad it."""
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from jaxreg.dense.alignment import align_coarse, align_fine
 from jaxreg.dense.candidates import select_candidates
 from jaxreg.dense.compatibility import compatibility
 from jaxreg.dense.hypotheses import best_of, pick_distinct, pose_hypotheses, screen
-from jaxreg.dense.moments import moment_descriptors, openness, standardized
+from jaxreg.dense.moments import Descriptors, moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
 from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
@@ -106,24 +107,27 @@ def surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
         jnp.ones(points.shape[0], bool) if mask is None else mask
         for points, mask in ((x, source_mask), (y, reference_mask))
     ]
-    described = [
-        moment_descriptors(points, mask, radii=config.radii, normal_radius=config.normal_radius)
-        for points, mask in zip((x, y), masks, strict=True)
-    ]
+    described, rims = zip(
+        *(_described(points, mask, config) for points, mask in zip((x, y), masks, strict=True)),
+        strict=True,
+    )
     features = [cloud.features for cloud in described]
     local = standardized(*(f[:, : f.shape[1] // len(config.radii)] for f in features), *masks)
     source, reference = (
-        Surface(
-            points,
-            cloud.normals,
-            openness(points, cloud.normals, mask, radius=config.rim_radius),
-            nearby,
-            mask,
+        Surface(points, cloud.normals, rim, nearby, mask)
+        for points, cloud, rim, nearby, mask in zip(
+            (x, y), described, rims, local, masks, strict=True
         )
-        for points, cloud, nearby, mask in zip((x, y), described, local, masks, strict=True)
     )
     one, other = standardized(*features, *masks)
     return source, reference, jnp.matmul(one, other.T)
+
+
+@functools.partial(jax.jit, static_argnames="config")  # Traced once for two clouds of one size.
+def _described(points: Array, mask: Array, config: DenseConfig) -> tuple[Descriptors, Array]:
+    """Descriptors of a cloud, and how open it is around every point."""
+    cloud = moment_descriptors(points, mask, radii=config.radii, normal_radius=config.normal_radius)
+    return cloud, openness(points, cloud.normals, mask, radius=config.rim_radius)
 
 
 def _search(
@@ -208,7 +212,7 @@ def _distinct_best(poses, score: Array, most: int, angle: float, distance: float
 
 
 def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:
-    trace = jnp.trace(poses.rotation, axis1=1, axis2=2)
+    trace = jnp.sum(jnp.diagonal(poses.rotation, axis1=1, axis2=2), axis=1)
     return trace >= 1 + 2 * jnp.cos(angle) - 1e-5
 
 

@@ -9,6 +9,7 @@ too, whatever cut the clouds.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float, Int
@@ -99,13 +100,14 @@ def plausibility(
     return evidence.match + alike * evidence.alike - against
 
 
+@jax.jit  # Traced once for both directions.
 def _one_way(
     moved: Surface,
     other: Surface,
     nearest: Int[Array, "n"],
     width: Float[Array, ""] | float,
     plane_width: Float[Array, ""] | float,
-    rim: float,
+    rim: Float[Array, ""] | float,
 ) -> tuple[Array, Array, Array, Array]:
     residual = moved.points - other.points[nearest]
     normal = other.normals[nearest]

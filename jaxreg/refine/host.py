@@ -79,10 +79,10 @@ def refine(
     reference_cloud = index_cloud(y, neighbors=neighbors)
     pose, taken, converged, pairs = iterate(
         start, source_cloud, reference_cloud, weighting,
-        np.asarray(widenings(iterations, anneal, np.dtype("float32"))),
+        widenings(iterations, anneal, np.dtype("float32")),
         method=method, thickness=thickness, both_directions=both_directions, tolerance=tolerance,
     )  # fmt: skip
-    moved = jnp.asarray(_padded(x @ pose.rotation.T + pose.translation)[0])
+    moved, _ = _padded(x @ pose.rotation.T + pose.translation)
     uncertainty = _uncertainty(
         moved, reference_cloud.padded, reference_cloud.normals, pairs,
         weighting.scale, weighting.max_distance, kernel=kernel, trim=trim,

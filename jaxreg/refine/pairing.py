@@ -3,6 +3,7 @@
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.neighbors import nearest_in
@@ -120,9 +121,9 @@ def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
     )
 
 
-def widenings(iterations: int, anneal: float, dtype: jnp.dtype) -> Float[Array, "iterations"]:
+def widenings(iterations: int, anneal: float, dtype: jnp.dtype) -> Float[np.ndarray, "iterations"]:
     """How much wider than its final width the kernel is: from `anneal` to 1 by equal factors."""
-    return jnp.asarray(anneal, dtype) ** jnp.linspace(1, 0, iterations, dtype=dtype)
+    return np.geomspace(anneal, 1, iterations).astype(dtype)
 
 
 def masked_quantile(

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
@@ -45,8 +44,8 @@ def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
     size = padded_size(len(points))
     rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
     rows[: len(points)] = index
-    padded = jnp.asarray(np.pad(points, ((0, size - len(points)), (0, 0))))
-    return IndexedCloud(points, tree, padded, _normals(padded, jnp.asarray(rows)))
+    padded = jax.device_put(np.pad(points, ((0, size - len(points)), (0, 0))))
+    return IndexedCloud(points, tree, padded, _normals(padded, rows))
 
 
 def iterate(
@@ -74,7 +73,7 @@ def iterate(
         while i < len(widths) and not (converged and widths[i] == 1):
             pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
             new = _step(
-                jax.tree.map(jnp.asarray, pose), source[2:], reference[2:], pairs,
+                pose, source[2:], reference[2:], pairs,
                 weighting.scale, weighting.max_distance, float(widths[i]),
                 kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
             )  # fmt: skip
@@ -108,9 +107,9 @@ def tree_pairs(
     count = len(source_index)
     padding = (0, padded_size(count) - count)
     return Pairs(
-        jnp.asarray(np.pad(source_index, padding).astype(np.int32)),
-        jnp.asarray(np.pad(reference_index, padding).astype(np.int32)),
-        jnp.asarray(np.pad(np.ones(count, bool), padding)),
+        np.pad(source_index, padding).astype(np.int32),
+        np.pad(reference_index, padding).astype(np.int32),
+        np.pad(np.ones(count, bool), padding),
     )
 
 

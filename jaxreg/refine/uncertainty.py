@@ -114,7 +114,7 @@ def uncertainty_of_pairs(
     information, _ = normal_equations(x, y, metric)
     weight = jnp.sum(jnp.trace(metric, axis1=1, axis2=2))
     residual = x - y
-    squared = jnp.einsum("pi,pij,pj->", residual, metric, residual, precision="highest")
+    squared = jnp.sum(metric * residual[:, :, None] * residual[:, None, :])
     # Six parameters were fitted; fewer weights than that determine nothing.
     variance = squared / jnp.maximum(weight - 6, 1)
     units = jnp.concatenate([jnp.ones(3, x.dtype), jnp.full(3, where.length)])
