@@ -42,9 +42,13 @@ def register_dense(
     *,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
+    similarity: Float[Array, "n m"] | None = None,
     config: DenseConfig = _DEFAULT,
 ) -> Registration:
     """The pose of the source in the frame of the reference, from any start and without learning.
+
+    `similarity` are the cosines, in [-1, 1], of any features of the points, from which matches are
+    taken in place of those of the moments.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
     `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `config.match_width`. The pose
@@ -54,7 +58,7 @@ def register_dense(
       ValueError: a cloud is not (n, 3), or has fewer points than `config.matches` + 1.
     """
     where, x, y = _enter(source, reference, source_mask, reference_mask, config)
-    found = _search(x, y, source_mask, reference_mask, config)
+    found = _search(x, y, source_mask, reference_mask, similarity, config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
     pose = gicp(
         x,
@@ -78,18 +82,19 @@ def search_dense(
     *,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
+    similarity: Float[Array, "n m"] | None = None,
     also: RigidTransform | None = None,
     largest_angle: Float[Array, ""] | float = math.pi,
     config: DenseConfig = _DEFAULT,
 ) -> Search:
-    """The poses of the search before the last refinement; errors as `register_dense`.
+    """The poses of the search before the last refinement; arguments and errors as `register_dense`.
 
     `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
     (radians) are not.
     """
     where, x, y = _enter(source, reference, source_mask, reference_mask, config)
     also = None if also is None else frame.transform_in(where, also)
-    found = _search(x, y, source_mask, reference_mask, config, also, largest_angle)
+    found = _search(x, y, source_mask, reference_mask, similarity, config, also, largest_angle)
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
 
 
@@ -131,11 +136,18 @@ def _described(points: Array, mask: Array, config: DenseConfig) -> tuple[Descrip
 
 
 def _search(
-    x, y, source_mask, reference_mask, config: DenseConfig, also=None, largest_angle=math.pi
+    x,
+    y,
+    source_mask,
+    reference_mask,
+    similarity,
+    config: DenseConfig,
+    also=None,
+    largest_angle=math.pi,
 ) -> Search:
-    x, y = jax.lax.stop_gradient((x, y))
-    source, reference, similarity = surfaces(x, y, source_mask, reference_mask, config)
-    poses = _hypotheses(source, reference, similarity, config)
+    x, y, similarity = jax.lax.stop_gradient((x, y, similarity))
+    source, reference, of_moments = surfaces(x, y, source_mask, reference_mask, config)
+    poses = _hypotheses(source, reference, of_moments if similarity is None else similarity, config)
     grids = [
         nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
         for s in (reference, source)
