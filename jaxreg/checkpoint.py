@@ -132,10 +132,14 @@ def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
 
 def _restore(manager: ocp.CheckpointManager, state: Any) -> Any:
     abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
-    return manager.restore(
-        manager.latest_step(),
-        args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract)),
-    )["state"]
+    wanted = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+    try:
+        return manager.restore(manager.latest_step(), args=wanted)["state"]
+    except ValueError as error:
+        raise ValueError(
+            f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg "
+            "writes: evaluate or resume it with the version that trained it, or train again."
+        ) from error
 
 
 def _difference(saved: Config, wanted: Config) -> str:

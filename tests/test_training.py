@@ -156,3 +156,10 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(config, tmp_path
 def test_no_checkpoint_is_an_error_that_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match="--workdir"):
         training.load_checkpoint(tmp_path)
+
+
+def test_a_checkpoint_with_other_arrays_is_an_error_that_says_so(config, tmp_path):
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(1, {"weights": jnp.zeros(3)}, error=1.0)
+    with pytest.raises(ValueError, match="other arrays than this version"):
+        training.load_checkpoint(tmp_path)
