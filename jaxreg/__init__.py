@@ -3,15 +3,20 @@
 Everything public is here. Functions of one pair are pure: `jax.jit`, `jax.vmap` and `jax.grad` them.
 """
 
+import importlib
+from typing import TYPE_CHECKING
+
 from jaxreg.config import Config, load_config
-from jaxreg.model import init_variables, register_pair
 from jaxreg.neighbors import knn, nearest_neighbor
 from jaxreg.numerics import included_angle
-from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.procrustes import weighted_procrustes
 from jaxreg.register import ScanRegistration, register
 from jaxreg.rigid import apply, compose, from_matrix, identity, inverse, to_matrix
 from jaxreg.types import Pair, PointCloud, Registration, RigidTransform
+
+if TYPE_CHECKING:
+    from jaxreg.model import init_variables, register_pair
+    from jaxreg.pretrained import available_weights, load_pretrained
 
 __version__ = "0.1.0"
 
@@ -39,3 +44,21 @@ __all__ = [
     "to_matrix",
     "weighted_procrustes",
 ]
+
+# Flax takes 0.2 s to import: two scans are registered without it, so these wait until they are used.
+_WITH_FLAX = {
+    "available_weights": "jaxreg.pretrained",
+    "init_variables": "jaxreg.model",
+    "load_pretrained": "jaxreg.pretrained",
+    "register_pair": "jaxreg.model",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _WITH_FLAX:
+        raise AttributeError(f"module 'jaxreg' has no attribute '{name}'")
+    return getattr(importlib.import_module(_WITH_FLAX[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_WITH_FLAX})

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+import jaxreg
+
 PICTURES, CHECKPOINTS, MESHES = {"matplotlib", "PIL"}, {"orbax", "tensorstore"}, {"trimesh"}
 TRAINING, FILES, BROWSER = {"optax", "h5py"}, {"plyfile", "laspy"}, {"plotly", "selenium"}
 HEAVY = PICTURES | CHECKPOINTS | MESHES | TRAINING | FILES | BROWSER | {"open3d", "sklearn"}
@@ -32,13 +34,23 @@ def test_the_list_is_of_modules_that_exist_here():
 @pytest.mark.parametrize(
     ("code", "unneeded"),
     [
-        ("import jaxreg", HEAVY | SCIPY | {"tyro", "rich.progress"}),
-        ("import jaxreg.cli", HEAVY | SCIPY),
+        ("import jaxreg", HEAVY | SCIPY | {"flax", "tyro", "rich.progress"}),
+        ("import jaxreg.cli, jaxreg.register", HEAVY | SCIPY | {"flax"}),
         ("import jaxreg.io, jaxreg.summary, jaxreg.viewer", (HEAVY - {"plyfile"}) | SCIPY),
     ],
 )
 def test_start_is_lean(code, unneeded):
     assert loaded_by(code) & unneeded == set()
+
+
+def test_every_public_name_is_there_and_no_other():
+    found = loaded_by(
+        "from jaxreg import *\nimport jaxreg\nassert set(jaxreg.__all__) <= set(dir())"
+    )
+    assert "flax" in found
+    assert set(jaxreg.__all__) <= set(dir(jaxreg))
+    with pytest.raises(AttributeError, match="no attribute 'register_pairs'"):
+        jaxreg.register_pairs  # noqa: B018
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="huge pages are asked of glibc")
