@@ -102,10 +102,14 @@ def _edge_invariants(points, normals, neighbors, radius: float) -> jax.Array:
 def inputs_of(x: jax.Array, y: jax.Array):
     """Of both clouds: features that a network reads, and normals; and the cosines of the moments."""
     found = [
-        moment_descriptors(p, radii=_DENSE.radii, normal_radius=_DENSE.normal_radius) for p in (x, y)
+        moment_descriptors(p, radii=_DENSE.radii, normal_radius=_DENSE.normal_radius)
+        for p in (x, y)
     ]
     moments = standardized(*(f.features for f in found))
-    rims = [openness(p, f.normals, jnp.ones(len(p), bool), radius=_DENSE.rim_radius) for p, f in zip((x, y), found, strict=True)]
+    rims = [
+        openness(p, f.normals, jnp.ones(len(p), bool), radius=_DENSE.rim_radius)
+        for p, f in zip((x, y), found, strict=True)
+    ]
     features = [
         jnp.concatenate([m * np.sqrt(m.shape[1]), rim[:, None] * 4], axis=1)
         for m, rim in zip(moments, rims, strict=True)
@@ -171,14 +175,22 @@ def fit(module: nn.Module, clouds: np.ndarray, options: Options):
         updates, state = optimizer.update(gradient, state, weights)
         return optax.apply_updates(weights, updates), state, value
 
-    rng, state, begin, seen = np.random.default_rng(options.seed), optimizer.init(weights), time.perf_counter(), []
+    rng, state, begin, seen = (
+        np.random.default_rng(options.seed),
+        optimizer.init(weights),
+        time.perf_counter(),
+        [],
+    )
     for number in range(options.steps):
         chosen = clouds[rng.integers(0, len(clouds), options.batch)]
         key = jax.random.fold_in(jax.random.key(options.seed + 1), number)
         weights, state, value = step(weights, state, key, chosen, KINDS[number % len(KINDS)])
         seen.append(float(value))
         if (number + 1) % (options.steps // 10) == 0:
-            print(f"step {number + 1}: loss {np.mean(seen[-options.steps // 10 :]):.3f}, sharpness {np.exp(float(weights['log_sharpness'])):.1f}, {time.perf_counter() - begin:.0f} s", flush=True)
+            print(
+                f"step {number + 1}: loss {np.mean(seen[-options.steps // 10 :]):.3f}, sharpness {np.exp(float(weights['log_sharpness'])):.1f}, {time.perf_counter() - begin:.0f} s",
+                flush=True,
+            )
     return weights["module"]
 
 
@@ -207,16 +219,22 @@ def searches(modules: dict):
     return {name: run(name) for name in ("moments", "linear", "network", "both")}
 
 
-def test(found, clouds: list[np.ndarray], options: Options, seed: int) -> dict[str, tuple[float, float, float]]:
+def test(
+    found, clouds: list[np.ndarray], options: Options, seed: int
+) -> dict[str, tuple[float, float, float]]:
     """Of each kind: share of true best matches, of right poses, and of pairs with one among eight."""
     results = {}
     for kind in KINDS:
         rows = []
         for number in range(options.test_pairs):
             key = jax.random.fold_in(jax.random.key(seed), number)
-            pair = protocols.draw(key, clouds[number % len(clouds)], config=pair_config(kind), turned=True)
+            pair = protocols.draw(
+                key, clouds[number % len(clouds)], config=pair_config(kind), turned=True
+            )
             poses, share = found(pair.source.points, pair.reference.points, pair.transform)
-            truth = jax.tree.map(lambda x, p=poses: np.broadcast_to(x, (len(p.rotation), *x.shape)), pair.transform)
+            truth = jax.tree.map(
+                lambda x, p=poses: np.broadcast_to(x, (len(p.rotation), *x.shape)), pair.transform
+            )
             errors = pair_errors(jax.tree.map(np.asarray, poses), jax.tree.map(np.asarray, truth))
             right = (errors.rre_deg < 5) & (errors.rte < 0.1)
             rows.append((float(share), right[0], right.any()))
@@ -228,12 +246,18 @@ def main() -> None:
     """Train, then print a line for every kind of features and set of shapes."""
     options = tyro.cli(Options, description=__doc__)
     compilation.enable_compilation_cache()
-    clouds = np.stack([shapes.sample_shape(options.seed, i, points=2048) for i in range(options.shapes)])
+    clouds = np.stack(
+        [shapes.sample_shape(options.seed, i, points=2048) for i in range(options.shapes)]
+    )
     modules = {}
     for name, module in (("linear", Linear(options.width)), ("network", Network(options.width))):
         print(name, flush=True)
         modules[name] = module, fit(module, clouds, options)
-    sets = {"procedural": [shapes.sample_shape(options.seed + 1, i, points=2048) for i in range(options.test_pairs)]}
+    sets = {
+        "procedural": [
+            shapes.sample_shape(options.seed + 1, i, points=2048) for i in range(options.test_pairs)
+        ]
+    }
     root = data_root(options.data_root, protocols.CONFIGS / "any.toml")
     if root is not None:
         dense, names = protocols.load_shapes(root, 6)

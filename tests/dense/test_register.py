@@ -40,6 +40,13 @@ def shape(rng, n):
     return points * sizes[box] + centres[box]
 
 
+def box(rng, n):
+    """A box of three different edges."""
+    side, points = rng.integers(0, 3, n), rng.uniform(-0.5, 0.5, (n, 3))
+    points[np.arange(n), side] = rng.choice([-0.5, 0.5], n)
+    return points * [1.6, 1.1, 0.7]
+
+
 def padded(points, rows, value):
     full = np.full((rows, 3), value, np.float32)
     full[: len(points)] = points
@@ -72,6 +79,26 @@ def test_any_rotation_of_another_sampling_with_padding(scale, seed):
     moved = source @ np.asarray(found.rotation).T + np.asarray(found.translation)
     gap = np.linalg.norm(moved - np.asarray(found.correspondences)[:380], axis=1)
     assert np.median(gap) < 0.08 * scale
+
+
+def test_matches_come_from_the_similarity_that_is_given(seed):
+    """Of the four poses of a box, which fit alike, the one whose matches look alike."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=rng).as_matrix()
+    source, reference = box(rng, 380), box(rng, 340)
+    x, mask = padded(source @ turn, 400, np.nan)
+    y, other = padded(reference, 400, np.nan)
+    solve = jax.jit(
+        lambda alike: register_dense(
+            x, y, source_mask=mask, reference_mask=other, similarity=alike, config=CONFIG
+        )
+    )
+    for symmetry in ([1, 1, 1], [1, -1, -1], [-1, -1, 1]):
+        gap = np.linalg.norm((source * symmetry)[:, None] - reference[None], axis=2)
+        alike = np.full((400, 400), np.nan, np.float32)  # Padding may hold anything.
+        alike[:380, :340] = 2 * np.exp(-((gap / 0.2) ** 2)) - 1
+        found = solve(jnp.asarray(alike))
+        assert angle_deg(found.rotation, np.diag(symmetry) @ turn) < 2
 
 
 def test_no_valid_point_gives_the_identity(seed):
