@@ -1,25 +1,26 @@
-"""Do learned features find more true matches than the moments of the dense search?
+"""Train the features of the dense search, and compare them with what it does without learning.
 
-    python -m benchmarks.learned_features --data-root DATA
+    python -m benchmarks.learned_features --save jaxreg/dense/weights --data-root DATA
 
-The whole search stays as it is, only the similarity of the points changes:
+The whole search stays as it is, only the features that points are matched by change:
 
-`moments`  what the library compares, without learning
-`linear`   the same moments under a learned matrix, the control: learning without a network
-`network`  the moments passed along the edges of two neighbourhood graphs, with invariants of distance
-           and normals on every edge (no coordinates, so any rotation gives the same)
-`both`     the mean of the cosines of moments and network
+`moments`  without learning
+`linear`   the moments under a learned matrix, the control: learning without a network
+`network`  `jaxreg.dense.learned`: the moments passed along the surface
+`network, 1-NN`  the same, with the paper's 1-NN strategy: nearest neighbours should match too
 
 Linear and network are trained by the same contrastive loss (InfoNCE in both directions) on the same
-pairs: procedural shapes, crops of 70 % with and without jitter and of 50 %, whose poses are known.
-Nothing of ModelNet40 is trained on; the dense clouds of its shapes are what is tested on.
+pairs: procedural shapes whose pose is known, crops of 70 % with and without jitter and of 50 %, any
+rotation, half to all of the points. Nothing of ModelNet40 is trained on; its dense clouds are what is
+tested on.
 """
 
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
+from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,106 +31,89 @@ from benchmarks import protocols
 from jaxreg import compilation, rigid
 from jaxreg.config import DenseConfig, PairConfig, load_config
 from jaxreg.data import data_root, shapes
-from jaxreg.dense.moments import moment_descriptors, openness, standardized
-from jaxreg.dense.register import search_dense
+from jaxreg.dense.learned import init_network, load_network
+from jaxreg.dense.moments import moment_descriptors, standardized
+from jaxreg.dense.register import enter, search_dense, surfaces
 from jaxreg.metrics import pair_errors
-from jaxreg.neighbors import knn, squared_distances
+from jaxreg.neighbors import nearest_neighbor, squared_distances
 from jaxreg.numerics import safe_norm
+from jaxreg.pretrained import save_weights
 
 KINDS = ("crops70", "crops70_jitter", "crops50")
-_DENSE = DenseConfig(unit=1.0)
+_DENSE = DenseConfig()
 _SAME, _APART = 0.06, 0.12
-"""A match is right within the first distance; between the two it is neither right nor wrong."""
+"""A match is right within the first distance (unit sphere); up to the second it is neither."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What to run."""
 
-    shapes: int = 1500
+    shapes: int = 2000
     """Procedural shapes to train on."""
-    steps: int = 1500
+    steps: int = 1800
     batch: int = 4
     rate: float = 2e-3
-    width: int = 64
+    features: tuple[str, ...] = ("linear", "network")
+    """What to train; the moments are always compared."""
+    released: bool = False
+    """Take the released network in place of training one."""
+    save: str = ""
+    """Write the network's weights and their card to this folder."""
     test_pairs: int = 64
     """Of each kind, from each of procedural and ModelNet40 shapes."""
+    test_seed: int = 5
     seed: int = 0
     data_root: str | None = None
 
 
-class Linear(nn.Module):
-    """Features under a matrix."""
-
-    width: int
-
-    @nn.compact
-    def __call__(self, features, points, normals):
-        return _unit(nn.Dense(self.width, use_bias=False)(features))
-
-
-class Network(nn.Module):
-    """Messages along the edges to near points, then to points farther away."""
-
-    width: int
-
-    @nn.compact
-    def __call__(self, features, points, normals):
-        hidden = nn.gelu(nn.Dense(self.width)(features))
-        graph = knn(points, 64)
-        for neighbors, radius in ((graph[:, :16], 0.15), (graph[:, 3::4], 0.3)):
-            edges = _edge_invariants(points, normals, neighbors, radius)
-            messages = nn.Dense(self.width)(edges) + nn.Dense(self.width)(hidden)[neighbors]
-            messages = nn.gelu(messages + nn.Dense(self.width)(hidden)[:, None])
-            pooled = jnp.concatenate([jnp.max(messages, axis=1), jnp.mean(messages, axis=1)], -1)
-            hidden = hidden + nn.Dense(self.width)(nn.gelu(nn.Dense(self.width)(pooled)))
-        return _unit(nn.Dense(self.width)(nn.gelu(hidden)))
-
-
-def _unit(x: jax.Array) -> jax.Array:
-    return x / jnp.maximum(safe_norm(x), 1e-6)[:, None]
-
-
-def _edge_invariants(points, normals, neighbors, radius: float) -> jax.Array:
-    offset = points[neighbors] - points[:, None]
-    length = safe_norm(offset)
-    direction = offset / jnp.maximum(length, 1e-6)[..., None]
-    own, other = normals[:, None], normals[neighbors]
-    cosines = [jnp.sum(a * b, -1) for a, b in ((own, direction), (other, direction), (own, other))]
-    return jnp.stack([length / radius, *(jnp.abs(c) for c in cosines)], axis=-1)
-
-
-def inputs_of(x: jax.Array, y: jax.Array):
-    """Of both clouds: features that a network reads, and normals; and the cosines of the moments."""
+def linear_cosines(matrix, x, y, x_mask, y_mask) -> jax.Array:
+    """Cosines of the moments under a matrix."""
     found = [
-        moment_descriptors(p, radii=_DENSE.radii, normal_radius=_DENSE.normal_radius)
-        for p in (x, y)
+        moment_descriptors(p, mask, radii=_DENSE.radii, normal_radius=_DENSE.normal_radius).features
+        for p, mask in ((x, x_mask), (y, y_mask))
     ]
-    moments = standardized(*(f.features for f in found))
-    rims = [
-        openness(p, f.normals, jnp.ones(len(p), bool), radius=_DENSE.rim_radius)
-        for p, f in zip((x, y), found, strict=True)
-    ]
-    features = [
-        jnp.concatenate([m * np.sqrt(m.shape[1]), rim[:, None] * 4], axis=1)
-        for m, rim in zip(moments, rims, strict=True)
-    ]
-    return features, [f.normals for f in found], moments[0] @ moments[1].T
+    mapped = [f @ matrix for f in standardized(*found, x_mask, y_mask)]
+    one, other = (f / jnp.maximum(safe_norm(f), 1e-6)[:, None] for f in mapped)
+    return one @ other.T
 
 
-def similarity(module, weights, x: jax.Array, y: jax.Array):
-    """Cosines of the learned features, and of the moments."""
-    features, normals, of_moments = inputs_of(x, y)
-    one, other = (
-        module.apply(weights, *parts) for parts in zip(features, (x, y), normals, strict=True)
-    )
-    return one @ other.T, of_moments
+def network_cosines(network, x, y, x_mask, y_mask) -> jax.Array:
+    """Cosines of the features of the library; of the moments, where `network` is None."""
+    return surfaces(x, y, x_mask, y_mask, _DENSE, network)[2]
 
 
-def contrastive_loss(cosines: jax.Array, sharpness: jax.Array, squared: jax.Array) -> jax.Array:
-    """InfoNCE over rows and columns that have a right match."""
-    right, unclear = squared < _SAME**2, (squared >= _SAME**2) & (squared < _APART**2)
-    logits = jnp.where(unclear, -1e9, cosines * sharpness)
+def one_nn_cosines(network, x, y, x_mask, y_mask) -> jax.Array:
+    """The mean of the cosines of two points and of their nearest neighbours, as the paper's Eq. 5."""
+    found = network_cosines(network, x, y, x_mask, y_mask)
+    return (found + found[nearest_neighbor(x, x_mask)][:, nearest_neighbor(y, y_mask)]) / 2
+
+
+COSINES: dict[str, Callable] = {
+    "moments": network_cosines,
+    "linear": linear_cosines,
+    "network": network_cosines,
+    "network, 1-NN": one_nn_cosines,
+}
+
+
+def init_weights(name: str, seed: int) -> Any:
+    """The weights before the first step; the linear control starts as the moments are."""
+    return jnp.eye(48) if name == "linear" else init_network(jax.random.key(seed))
+
+
+def contrastive_loss(
+    cosines: jax.Array,
+    sharpness: jax.Array,
+    squared: jax.Array,
+    x_mask: jax.Array,
+    y_mask: jax.Array,
+) -> jax.Array:
+    """InfoNCE over the rows and columns that have a right match."""
+    both = x_mask[:, None] & y_mask[None, :]
+    right = (squared < _SAME**2) & both
+    unclear = (squared >= _SAME**2) & (squared < _APART**2)
+    logits = jnp.where(unclear | ~both, -1e9, cosines * sharpness)
 
     def one_way(axis: int):
         chosen = jax.nn.logsumexp(jnp.where(right, logits, -1e9), axis=axis)
@@ -146,88 +130,81 @@ def pair_config(kind: str) -> PairConfig:
     return protocols.at_size(config, 4096)
 
 
-def fit(module: nn.Module, clouds: np.ndarray, options: Options):
+def fit(name: str, clouds: np.ndarray, options: Options) -> Any:
     """Weights that minimise the contrastive loss; a step takes pairs of one kind."""
-    start = module.init(
-        jax.random.key(options.seed), jnp.zeros((80, 49)), jnp.zeros((80, 3)), jnp.zeros((80, 3))
-    )
-    weights = {"module": start, "log_sharpness": jnp.log(10.0)}
+    weights = {"features": init_weights(name, options.seed), "log_sharpness": jnp.log(10.0)}
     rate = optax.warmup_cosine_decay_schedule(0, options.rate, options.steps // 20, options.steps)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=1e-4))
+
+    def pair_loss(weights, pair, share, key):
+        x, y = pair.source.points, pair.reference.points
+        masks = [
+            jax.random.uniform(k, (len(p),)) < share
+            for k, p in zip(jax.random.split(key), (x, y), strict=True)
+        ]
+        squared = squared_distances(rigid.apply(pair.transform, x), y)
+        _, x, y = enter(x, y, *masks, _DENSE)
+        cosines = COSINES[name](weights["features"], x, y, *masks)
+        return contrastive_loss(cosines, jnp.exp(weights["log_sharpness"]), squared, *masks)
 
     @functools.partial(compilation.jit, static_argnames="kind")
     def step(weights, state, key, chosen, kind: str):
         config = pair_config(kind)
+        draw_key, mask_key, share_key = jax.random.split(key, 3)
+        draw_keys, mask_keys = (jax.random.split(k, len(chosen)) for k in (draw_key, mask_key))
         pairs = jax.vmap(lambda k, c: protocols.draw(k, c, config=config, turned=True))(
-            jax.random.split(key, len(chosen)), chosen
+            draw_keys, chosen
         )
+        shares = jax.random.uniform(share_key, (len(chosen),), minval=0.5)
 
         def loss(weights):
-            def one(pair):
-                x, y = pair.source.points, pair.reference.points
-                cosines, _ = similarity(module, weights["module"], x, y)
-                squared = squared_distances(rigid.apply(pair.transform, x), y)
-                return contrastive_loss(cosines, jnp.exp(weights["log_sharpness"]), squared)
-
-            return jnp.mean(jax.vmap(one)(pairs))
+            each = jax.vmap(pair_loss, in_axes=(None, 0, 0, 0))
+            return jnp.mean(each(weights, pairs, shares, mask_keys))
 
         value, gradient = jax.value_and_grad(loss)(weights)
         updates, state = optimizer.update(gradient, state, weights)
         return optax.apply_updates(weights, updates), state, value
 
-    rng, state, begin, seen = (
-        np.random.default_rng(options.seed),
-        optimizer.init(weights),
-        time.perf_counter(),
-        [],
-    )
+    rng, state = np.random.default_rng(options.seed), optimizer.init(weights)
+    begin, seen, often = time.perf_counter(), [], max(options.steps // 10, 1)
     for number in range(options.steps):
         chosen = clouds[rng.integers(0, len(clouds), options.batch)]
         key = jax.random.fold_in(jax.random.key(options.seed + 1), number)
         weights, state, value = step(weights, state, key, chosen, KINDS[number % len(KINDS)])
         seen.append(float(value))
-        if (number + 1) % (options.steps // 10) == 0:
+        if (number + 1) % often == 0:
+            passed = time.perf_counter() - begin
             print(
-                f"step {number + 1}: loss {np.mean(seen[-options.steps // 10 :]):.3f}, sharpness {np.exp(float(weights['log_sharpness'])):.1f}, {time.perf_counter() - begin:.0f} s",
+                f"{name}, step {number + 1}: loss {np.mean(seen[-often:]):.3f}, {passed:.0f} s",
                 flush=True,
             )
-    return weights["module"]
+    return weights["features"]
 
 
-def searches(modules: dict):
-    """A compiled search of a pair for every kind of features: first pose, and share of true matches."""
+def search(name: str, weights: Any):
+    """A compiled search of a pair: the aligned poses, and the share of true best matches."""
 
-    def run(name: str):
-        @compilation.jit
-        def found(x, y, truth):
-            if name == "moments":
-                _, cosines = similarity(*modules["linear"], x, y)
-            elif name == "both":
-                learned, moments = similarity(*modules["network"], x, y)
-                cosines = (learned + moments) / 2
-            else:
-                cosines, _ = similarity(*modules[name], x, y)
-            squared = squared_distances(rigid.apply(truth, x), y)
-            has = jnp.min(squared, axis=1) < _SAME**2
-            best = jnp.take_along_axis(squared, jnp.argmax(cosines, axis=1)[:, None], axis=1)[:, 0]
-            share = jnp.sum((best < _SAME**2) & has) / jnp.maximum(jnp.sum(has), 1)
-            search = search_dense(x, y, similarity=cosines, config=_DENSE)
-            return search.poses, share
+    @compilation.jit
+    def found(x, y, truth):
+        masks = [jnp.ones(len(p), bool) for p in (x, y)]
+        _, a, b = enter(x, y, *masks, _DENSE)
+        cosines = COSINES[name](weights, a, b, *masks)
+        squared = squared_distances(rigid.apply(truth, x), y)
+        has = jnp.min(squared, axis=1) < _SAME**2
+        best = jnp.take_along_axis(squared, jnp.argmax(cosines, axis=1)[:, None], axis=1)[:, 0]
+        share = jnp.sum((best < _SAME**2) & has) / jnp.maximum(jnp.sum(has), 1)
+        return search_dense(x, y, similarity=cosines).poses, share
 
-        return found
-
-    return {name: run(name) for name in ("moments", "linear", "network", "both")}
+    return found
 
 
-def test(
-    found, clouds: list[np.ndarray], options: Options, seed: int
-) -> dict[str, tuple[float, float, float]]:
-    """Of each kind: share of true best matches, of right poses, and of pairs with one among eight."""
+def test(found, clouds: list[np.ndarray], options: Options) -> dict[str, tuple[float, ...]]:
+    """Of each kind: share of true best matches, of right poses, of pairs with one among eight."""
     results = {}
     for kind in KINDS:
         rows = []
         for number in range(options.test_pairs):
-            key = jax.random.fold_in(jax.random.key(seed), number)
+            key = jax.random.fold_in(jax.random.key(options.test_seed), number)
             pair = protocols.draw(
                 key, clouds[number % len(clouds)], config=pair_config(kind), turned=True
             )
@@ -242,35 +219,46 @@ def test(
     return results
 
 
+def clouds_to_test_on(options: Options) -> dict[str, list[np.ndarray]]:
+    """Procedural shapes that were not trained on, and ModelNet40's where they are found."""
+    fresh = [
+        shapes.sample_shape(options.seed + 1, i, points=2048) for i in range(options.test_pairs)
+    ]
+    root = data_root(options.data_root, protocols.CONFIGS / "any.toml")
+    if root is None:
+        return {"procedural": fresh}
+    dense, names = protocols.load_shapes(root, 6)
+    plain = np.flatnonzero(~np.isin(names, protocols.SYMMETRIC))
+    order = np.random.default_rng(options.test_seed).permutation(plain)
+    return {"procedural": fresh, "ModelNet40": list(dense[order])}
+
+
 def main() -> None:
-    """Train, then print a line for every kind of features and set of shapes."""
+    """Train, save, then print a line for every kind of features and set of shapes."""
     options = tyro.cli(Options, description=__doc__)
     compilation.enable_compilation_cache()
     clouds = np.stack(
         [shapes.sample_shape(options.seed, i, points=2048) for i in range(options.shapes)]
     )
-    modules = {}
-    for name, module in (("linear", Linear(options.width)), ("network", Network(options.width))):
-        print(name, flush=True)
-        modules[name] = module, fit(module, clouds, options)
-    sets = {
-        "procedural": [
-            shapes.sample_shape(options.seed + 1, i, points=2048) for i in range(options.test_pairs)
-        ]
-    }
-    root = data_root(options.data_root, protocols.CONFIGS / "any.toml")
-    if root is not None:
-        dense, names = protocols.load_shapes(root, 6)
-        plain = np.flatnonzero(~np.isin(names, protocols.SYMMETRIC))
-        sets["ModelNet40"] = list(dense[np.random.default_rng(options.seed + 5).permutation(plain)])
-    for label, chosen in sets.items():
-        for name, found in searches(modules).items():
-            rows = test(found, chosen, options, options.seed + 5)
-            print(
-                f"{label}, {name}: "
-                + ", ".join(f"{k} {m:.3f} / {r:.3f} / {a:.3f}" for k, (m, r, a) in rows.items()),
-                flush=True,
-            )
+    trained = {"moments": None}
+    for name in options.features:
+        released = options.released and name == "network"
+        trained[name] = load_network() if released else fit(name, clouds, options)
+    if "network" in trained:
+        trained["network, 1-NN"] = trained["network"]
+    if options.save and "network" in trained:
+        card = {
+            "command": "python -m benchmarks.learned_features --save jaxreg/dense/weights",
+            "data": f"{options.shapes} procedural shapes, seed {options.seed}",
+            "steps": options.steps,
+            "batch": options.batch,
+        }
+        save_weights(options.save, "features", trained["network"], _DENSE, card)
+    for label, chosen in clouds_to_test_on(options).items():
+        for name, weights in trained.items():
+            rows = test(search(name, weights), chosen, options)
+            figures = (f"{k} {m:.3f} / {r:.3f} / {a:.3f}" for k, (m, r, a) in rows.items())
+            print(f"{label}, {name}: {', '.join(figures)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from jax.scipy.spatial.transform import Rotation
 from jaxreg import classical, compilation, rigid
 from jaxreg.config import PairConfig, load_config
 from jaxreg.data import data_root, hdf5, make_pair, modelnet
-from jaxreg.dense import register_dense
+from jaxreg.dense import load_network, register_dense
 from jaxreg.metrics import pair_errors
 from jaxreg.model import register_pair
 from jaxreg.pretrained import load_pretrained
@@ -57,7 +57,7 @@ class Options:
     """What to run."""
 
     methods: tuple[str, ...] = ("dense",)
-    """`dense`, `register`, released weights (`weights:modelnet40`), or a baseline such as open3d_ransac_icp."""
+    """`dense` (without learning), `dense_learned`, `register`, released weights (`weights:modelnet40`), or a baseline such as open3d_ransac_icp."""
     protocols: tuple[str, ...] = PROTOCOLS
     """Files configs/modelnet40_NAME.toml."""
     curve: Literal["none", *CURVES] = "none"
@@ -113,8 +113,9 @@ def draw(key, shape, *, config: PairConfig, turned: bool) -> Pair:
 
 def choose(name: str) -> Solve:
     """One pair to a transform; errors as `jaxreg.classical.choose` and `load_pretrained`."""
-    if name == "dense":
-        found = compilation.jit(lambda x, y: register_dense(x, y))
+    if name in ("dense", "dense_learned"):
+        network = load_network() if name == "dense_learned" else None
+        found = compilation.jit(lambda x, y: register_dense(x, y, network=network))
     elif name == "register":
         return lambda p: RigidTransform(*register(p.source.points, p.reference.points)[:2])
     elif name.startswith("weights:"):

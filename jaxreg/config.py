@@ -212,6 +212,8 @@ class RegisterConfig:
 
     search_points: int = 1024
     """Most points of a cloud in the search for a pose; larger clouds are averaged in voxels."""
+    learned: bool = True
+    """Match points by learned features, which find more true matches than the moments they read."""
     limited_deg: float = 80.0
     """Largest rotation between two clouds that `rotation = "limited"` looks for."""
     reach: float = 1.5
@@ -231,7 +233,7 @@ class RegisterConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DenseConfig:
-    """Global registration without learning (`jaxreg.dense`).
+    """Global registration of clouds that share no point (`jaxreg.dense`).
 
     Lengths are in units in which a usual shape fills the unit sphere, angles in radians.
     """

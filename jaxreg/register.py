@@ -5,12 +5,14 @@ import functools
 import time
 from typing import Literal, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from jaxreg import compilation, scans, verdict
 from jaxreg.config import RegisterConfig
+from jaxreg.dense.learned import load_network
 from jaxreg.dense.register import search_dense
 from jaxreg.refine.host import Refined
 from jaxreg.refine.host import refine as refine_pose
@@ -127,6 +129,8 @@ _LEAST = {
 
 def _check_options(rotation: str, refine: str | None, config: RegisterConfig) -> None:
     for name, value in dataclasses.asdict(config).items():
+        if isinstance(value, bool):
+            continue
         least = _LEAST.get(name, 0)
         if not (least <= value < np.inf and value > 0):
             bound = f"at least {least}" if least else "positive"
@@ -172,7 +176,7 @@ def _searched(
     size = scans.bucket(max(len(x), len(y)), smallest=_SMALLEST, largest=config.search_points)
     unmoved = scans.pose_in(frame, RigidTransform(np.eye(3), np.zeros(3)))
     largest = 180.0 if rotation == "full" else config.limited_deg
-    poses, score = _search()(
+    poses, score = _search(config.learned)(
         *scans.padded(x, size),
         *scans.padded(y, size),
         # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
@@ -188,13 +192,20 @@ def _searched(
 
 
 @functools.cache
-def _search():
-    def run(x, x_mask, y, y_mask, also, largest_angle):
+def _search(learned: bool):
+    def run(network, x, x_mask, y, y_mask, also, largest_angle):
         return search_dense(
-            x, y, source_mask=x_mask, reference_mask=y_mask, also=also, largest_angle=largest_angle
+            x,
+            y,
+            source_mask=x_mask,
+            reference_mask=y_mask,
+            network=network,
+            also=also,
+            largest_angle=largest_angle,
         )
 
-    return compilation.jit(run)
+    network = jax.device_put(load_network()) if learned else None
+    return functools.partial(compilation.jit(run), network)
 
 
 def _angles(poses: RigidTransform, rotation: np.ndarray) -> Float[np.ndarray, "p"]:

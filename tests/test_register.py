@@ -271,10 +271,10 @@ def test_unknown_options(options):
 
 def test_sizes_in_one_bucket_compile_once(pair):
     register(pair[0][:490], pair[1][:480])
-    compiled = [f._cache_size() for f in (_search(), tree._step, tree._normals)]
+    compiled = [f._cache_size() for f in (_search(True).func, tree._step, tree._normals)]
     for size in range(460, 500, 5):
         register(pair[0][:size], pair[1][: size - 3])
-    assert [f._cache_size() for f in (_search(), tree._step, tree._normals)] == compiled
+    assert [f._cache_size() for f in (_search(True).func, tree._step, tree._normals)] == compiled
 
 
 def test_units_that_differ_beyond_single_precision(pair):

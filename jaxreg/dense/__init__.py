@@ -1,9 +1,10 @@
-"""Registration without learning, for any rotation, of clouds that share no point: `register_dense`.
+"""Registration for any rotation, of clouds that share no point: `register_dense`.
 
 Every stage is dense and of a fixed shape: products of (n, n) matrices instead of neighbour lists,
 one hypothesis from every candidate instead of sampling, a grid instead of a tree.
 """
 
+from jaxreg.dense.learned import load_network
 from jaxreg.dense.register import register_dense
 
-__all__ = ["register_dense"]
+__all__ = ["load_network", "register_dense"]

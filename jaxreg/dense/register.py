@@ -14,6 +14,7 @@ from jaxreg.dense.alignment import align_coarse, align_fine
 from jaxreg.dense.candidates import select_candidates
 from jaxreg.dense.compatibility import compatibility
 from jaxreg.dense.hypotheses import best_of, pick_distinct, pose_hypotheses, screen
+from jaxreg.dense.learned import Network, learned_features
 from jaxreg.dense.moments import Descriptors, moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
@@ -42,13 +43,15 @@ def register_dense(
     *,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
+    network: Network | None = None,
     similarity: Float[Array, "n m"] | None = None,
     config: DenseConfig = _DEFAULT,
 ) -> Registration:
-    """The pose of the source in the frame of the reference, from any start and without learning.
+    """The pose of the source in the frame of the reference, from any start.
 
-    `similarity` are the cosines, in [-1, 1], of any features of the points, from which matches are
-    taken in place of those of the moments.
+    Points are matched by their moments, without learning; or, given a `network`
+    (`jaxreg.dense.load_network`), by what it makes of these; or by a `similarity` of your own, the
+    cosines in [-1, 1] of any features.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
     `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `config.match_width`. The pose
@@ -57,8 +60,8 @@ def register_dense(
     Raises:
       ValueError: a cloud is not (n, 3), or has fewer points than `config.matches` + 1.
     """
-    where, x, y = _enter(source, reference, source_mask, reference_mask, config)
-    found = _search(x, y, source_mask, reference_mask, similarity, config)
+    where, x, y = enter(source, reference, source_mask, reference_mask, config)
+    found = _search(x, y, source_mask, reference_mask, network, similarity, config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
     pose = gicp(
         x,
@@ -82,6 +85,7 @@ def search_dense(
     *,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
+    network: Network | None = None,
     similarity: Float[Array, "n m"] | None = None,
     also: RigidTransform | None = None,
     largest_angle: Float[Array, ""] | float = math.pi,
@@ -92,13 +96,15 @@ def search_dense(
     `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
     (radians) are not.
     """
-    where, x, y = _enter(source, reference, source_mask, reference_mask, config)
+    where, x, y = enter(source, reference, source_mask, reference_mask, config)
     also = None if also is None else frame.transform_in(where, also)
-    found = _search(x, y, source_mask, reference_mask, similarity, config, also, largest_angle)
+    found = _search(
+        x, y, source_mask, reference_mask, network, similarity, config, also, largest_angle
+    )
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
 
 
-def _enter(source, reference, source_mask, reference_mask, config: DenseConfig):
+def enter(source, reference, source_mask, reference_mask, config: DenseConfig):
     """Both clouds centred, in units of which a usual shape fills the unit sphere."""
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
     factor = _RMS_OF_UNIT_SPHERE if config.unit == 0 else where.length / config.unit
@@ -106,8 +112,11 @@ def _enter(source, reference, source_mask, reference_mask, config: DenseConfig):
     return where, x * factor, y * factor
 
 
-def surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
-    """Both clouds with normals, rims and local features, and the cosines of all their features."""
+def surfaces(x, y, source_mask, reference_mask, config: DenseConfig, network=None):
+    """Both clouds with normals, rims and local features, and the cosines of all their features.
+
+    These are the moments, or what `network` makes of them.
+    """
     masks = [
         jnp.ones(points.shape[0], bool) if mask is None else mask
         for points, mask in ((x, source_mask), (y, reference_mask))
@@ -125,6 +134,11 @@ def surfaces(x, y, source_mask, reference_mask, config: DenseConfig):
         )
     )
     one, other = standardized(*features, *masks)
+    if network is not None:
+        one, other = (
+            learned_features(network, moments, s.openness, s.points, s.normals, s.mask)
+            for moments, s in ((one, source), (other, reference))
+        )
     return source, reference, jnp.matmul(one, other.T)
 
 
@@ -140,6 +154,7 @@ def _search(
     y,
     source_mask,
     reference_mask,
+    network,
     similarity,
     config: DenseConfig,
     also=None,
