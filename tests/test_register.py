@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg.config import RegisterConfig
 from jaxreg.data import shapes
 from jaxreg.refine import tree
 from jaxreg.register import _search, register
@@ -39,11 +40,14 @@ def result(pair):
     return register(*pair[:2])
 
 
-@pytest.mark.parametrize("index", [STAIRS, CHAIR, 1])
-def test_any_rotation_of_shapes_that_share_no_point(index, seed):
+@pytest.mark.parametrize(
+    ("index", "learned"), [(STAIRS, False), (CHAIR, False), (1, False), (CHAIR, True)]
+)
+def test_any_rotation_of_shapes_that_share_no_point(index, learned, seed):
     source, reference = halves(index)
     truth = motion(seed)
-    found = register(source, reference @ truth.rotation.T + truth.translation)
+    moved = reference @ truth.rotation.T + truth.translation
+    found = register(source, moved, config=RegisterConfig(learned=learned))
     assert angle_deg(found.rotation, truth.rotation) < 2
     centre = source.mean(axis=0)
     error = (found.rotation - truth.rotation) @ centre + found.translation - truth.translation
@@ -271,10 +275,10 @@ def test_unknown_options(options):
 
 def test_sizes_in_one_bucket_compile_once(pair):
     register(pair[0][:490], pair[1][:480])
-    compiled = [f._cache_size() for f in (_search(True).func, tree._step, tree._normals)]
+    compiled = [f._cache_size() for f in (_search(False).func, tree._step, tree._normals)]
     for size in range(460, 500, 5):
         register(pair[0][:size], pair[1][: size - 3])
-    assert [f._cache_size() for f in (_search(True).func, tree._step, tree._normals)] == compiled
+    assert [f._cache_size() for f in (_search(False).func, tree._step, tree._normals)] == compiled
 
 
 def test_units_that_differ_beyond_single_precision(pair):

@@ -161,8 +161,8 @@ def _search(
     largest_angle=math.pi,
 ) -> Search:
     x, y, similarity = jax.lax.stop_gradient((x, y, similarity))
-    source, reference, of_moments = surfaces(x, y, source_mask, reference_mask, config)
-    poses = _hypotheses(source, reference, of_moments if similarity is None else similarity, config)
+    source, reference, found = surfaces(x, y, source_mask, reference_mask, config, network)
+    poses = _hypotheses(source, reference, found if similarity is None else similarity, config)
     grids = [
         nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
         for s in (reference, source)

@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.config import DenseConfig
 from jaxreg.dense import register_dense
+from jaxreg.dense.learned import init_network
+from jaxreg.dense.register import enter, search_dense, surfaces
 
 pytestmark = [pytest.mark.float32]
 CONFIG = DenseConfig(candidates=256, grid_cells=16, screened=24, aligned=8)
@@ -99,6 +101,27 @@ def test_matches_come_from_the_similarity_that_is_given(seed):
         alike[:380, :340] = 2 * np.exp(-((gap / 0.2) ** 2)) - 1
         found = solve(jnp.asarray(alike))
         assert angle_deg(found.rotation, np.diag(symmetry) @ turn) < 2
+
+
+def test_a_network_matches_points_by_its_features(seed):
+    """The search is that of the cosines of its features, and not that of the moments."""
+    source, reference, _ = make_pair(seed)
+    network = init_network(jax.random.key(seed))
+    (x, mask), (y, other) = (padded(p, 400, np.nan) for p in (source, reference))
+    masks = {"source_mask": mask, "reference_mask": other}
+
+    @jax.jit
+    def searches(x, y):
+        _, a, b = enter(x, y, mask, other, CONFIG)
+        cosines = surfaces(a, b, mask, other, CONFIG, network)[2]
+        return [
+            search_dense(x, y, **masks, **features, config=CONFIG)
+            for features in ({"network": network}, {"similarity": cosines}, {})
+        ]
+
+    of_network, of_cosines, of_moments = searches(x, y)
+    np.testing.assert_allclose(of_network.score, of_cosines.score, atol=1e-3)
+    assert np.abs(of_network.score - of_moments.score).max() > 0.01
 
 
 def test_no_valid_point_gives_the_identity(seed):
