@@ -45,7 +45,7 @@ def operations(n: int, m: int, config: ModelConfig) -> dict[str, float]:
     """Operations of one call of every stage, for one pair (see above)."""
     k, c, w = config.k, config.width, config.inlier_width
     lift = sum(a * b for a, b in zip((3, *config.channels[:-1]), config.channels, strict=True))
-    angles, structure = k * (k - 1) / 2, 3 + k
+    angles, structure = (k, 4) if config.angles == "next" else (k * (k - 1) / 2, 3 + k)
     return {
         "graphs": 8 * n * n,
         "features": 2 * n * k * lift + 2 * n * sum(config.channels) * c,
@@ -123,7 +123,8 @@ def _inlier_programs(variables, config: ModelConfig) -> tuple[Callable, Callable
     own = {kind: tree["inliers"] for kind, tree in variables.items()}
 
     def trust(source, copy, neighbors):
-        structures = [geometric_structure(x, neighbors) for x in (source, copy)]
+        reading = {"edge": config.edge, "angles": config.angles}
+        structures = [geometric_structure(x, neighbors, **reading) for x in (source, copy)]
         return network.apply(own, *structures, jnp.ones(source.shape[0], bool), train=False)
 
     def solve(source, copy, confidence):

@@ -7,8 +7,8 @@ this is what a first port costs (`benchmarks/speed.py`), and since it shares no 
 library it is what the library's results and gradients are held to
 (`tests/benchmarks/test_transcription.py`).
 
-The readings are those of the released weights: `gather` for the 1-NN patch, edge vectors, all angles, the
-top N_c in the Procrustes. So are the parameters.
+The readings are those of the released weights: `gather` for the 1-NN patch, edge vectors, the top N_c in
+the Procrustes, angles to the next edge or to all. So are the parameters.
 """
 
 from typing import Any, NamedTuple
@@ -124,15 +124,16 @@ def matching(source_features, reference_features, source_neighbors, reference_ne
     return dual, jax.nn.softmax(-final, axis=1)
 
 
-def structure(points, neighbors):
-    """Edges (n, k, 3) and angles (n, k, k) of every neighbourhood (Eq. 7-8)."""
+def structure(points, neighbors, angles):
+    """Edges (n, k, 3) and angles (n, k, 1 or k) of every neighbourhood (Eq. 7-8)."""
     edges = points[:, None] - points[neighbors]
-    one, other = edges[:, :, None], edges[:, None]
+    following = jnp.roll(edges, -1, axis=1)[:, :, None]
+    one, other = edges[:, :, None], edges[:, None] if angles == "all" else following
     cross = jnp.cross(*jnp.broadcast_arrays(one, other))
     return edges, jnp.arctan2(norm(cross), jnp.sum(one * other, axis=-1))
 
 
-def confidence(variables, source, copy, neighbors, train):
+def confidence(variables, source, copy, neighbors, config, train):
     """w_i (Eq. 9-11)."""
     params, statistics = (variables[kind]["inliers"] for kind in ("params", "batch_stats"))
 
@@ -140,7 +141,8 @@ def confidence(variables, source, copy, neighbors, train):
         y = batch_norm(params[name], statistics[name], dense(params[f"Dense_{number}"], x), train)
         return jax.nn.leaky_relu(y, LEAK)
 
-    x = jnp.stack([jnp.concatenate(structure(p, neighbors), axis=-1) for p in (source, copy)])
+    shapes = [structure(p, neighbors, config.angles) for p in (source, copy)]
+    x = jnp.stack([jnp.concatenate(shape, axis=-1) for shape in shapes])
     fused = layer(1, "BatchNorm_1", layer(0, "BatchNorm_0", x))
     difference = fused[0] - fused[1]
     attention = dense(params["Dense_2"], layer(3, "BatchNorm_2", difference))
@@ -169,7 +171,7 @@ def step(variables, source, reference, config, train):
         source_features, reference_features, source_neighbors, reference_neighbors, config
     )
     copy = final @ reference
-    weights = confidence(variables, source, copy, near, train)
+    weights = confidence(variables, source, copy, near, config, train)
     inliers = jnp.argsort(-weights)[: config.n_inliers]
     motion = procrustes(source[inliers], copy[inliers], weights[inliers])
     return weights, Parts(source, copy, dual, near, inliers, *motion)
@@ -186,7 +188,7 @@ def register(variables: Any, source, reference, *, config) -> Result:
     return Result(rotation, translation, weights, parts.copy)
 
 
-def losses(parts, reference, config):
+def losses(parts, reference, config, angles):
     """L_gc + gamma L_in + rho L_gs + lambda L_sc of one iteration (Eq. 14-17)."""
     moved = parts.source @ parts.rotation.T + parts.translation[None]
     distance = squared_distances(moved, reference)
@@ -195,13 +197,13 @@ def losses(parts, reference, config):
     huber = jnp.where(nearest < beta, nearest**2 / 2, beta * nearest - beta**2 / 2)
     near = parts.neighbors[parts.inliers]
     within = norm(moved[near] - parts.copy[near])
-    shapes = [structure(x, parts.neighbors) for x in (parts.source, parts.copy)]
-    edges, angles = (norm((a - b)[parts.inliers]) for a, b in zip(*shapes, strict=True))
+    shapes = [structure(x, parts.neighbors, angles) for x in (parts.source, parts.copy)]
+    edges, included = (norm((a - b)[parts.inliers]) for a, b in zip(*shapes, strict=True))
     peak = jnp.max(parts.dual[parts.inliers], axis=1)
     return (
         config.global_consistency * jnp.sum(huber)
         + config.gamma * jnp.sum(within)
-        + config.rho * (jnp.sum(edges) + jnp.sum(angles))
+        + config.rho * (jnp.sum(edges) + jnp.sum(included))
         - config.lambda_ * jnp.mean(jnp.log(peak))
     )
 
@@ -214,7 +216,7 @@ def batch_loss(params: Any, statistics: Any, sources, references, *, config) -> 
         total = jnp.zeros((), source.dtype)
         for _ in range(config.model.iterations):
             _, parts = step(variables, source, reference, config.model, train=True)
-            total += losses(parts, reference, config.loss)
+            total += losses(parts, reference, config.loss, config.model.angles)
             source = source @ parts.rotation.T + parts.translation[None]
         return total
 
