@@ -213,8 +213,8 @@ class RegisterConfig:
     search_points: int = 1024
     """Most points of a cloud in the search for a pose; larger clouds are averaged in voxels."""
     learned: bool = False
-    """Match points by learned features in place of the moments that these read: more true matches, and a
-    few crops more of a hundred, for a quarter more of the time."""
+    """Match points by learned features in place of the moments that these read: more true matches,
+    and a few crops more of a hundred, for a quarter more of the time."""
     limited_deg: float = 80.0
     """Largest rotation between two clouds that `rotation = "limited"` looks for."""
     reach: float = 1.5
