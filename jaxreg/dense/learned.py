@@ -66,7 +66,7 @@ def learned_features(
     absolute cosines between it, the normal there and the normal here (normals have no sign).
     """
     points = without_padding(points, mask)
-    inputs = [moments * np.sqrt(moments.shape[1]), 4 * openness[:, None]]
+    inputs = [moments * moments.shape[1] ** 0.5, 4 * openness[:, None]]
     hidden = jax.nn.gelu(_layer(network, "lift", jnp.concatenate(inputs, axis=1)))
     graph = knn(points, min(_NEIGHBORS, len(points) - 1), mask)
     for name, chosen, radius in _ROUNDS:
