@@ -59,7 +59,7 @@ class Options:
     released: bool = False
     """Take the released network in place of training one."""
     save: str = ""
-    """Write the network's weights and their card to this folder."""
+    """Write the weights and the card of a network that was trained to this folder."""
     test_pairs: int = 64
     """Of each kind, from each of procedural and ModelNet40 shapes."""
     test_seed: int = 5
@@ -237,16 +237,16 @@ def main() -> None:
     """Train, save, then print a line for every kind of features and set of shapes."""
     options = tyro.cli(Options, description=__doc__)
     compilation.enable_compilation_cache()
-    clouds = np.stack(
-        [shapes.sample_shape(options.seed, i, points=2048) for i in range(options.shapes)]
-    )
     trained = {"moments": None}
-    for name in options.features:
-        released = options.released and name == "network"
-        trained[name] = load_network() if released else fit(name, clouds, options)
-    if "network" in trained:
-        trained["network, 1-NN"] = trained["network"]
-    if options.save and "network" in trained:
+    if options.released and "network" in options.features:
+        trained["network"] = load_network()
+    to_fit = [name for name in options.features if name not in trained]
+    if to_fit:
+        clouds = np.stack(
+            [shapes.sample_shape(options.seed, i, points=2048) for i in range(options.shapes)]
+        )
+        trained |= {name: fit(name, clouds, options) for name in to_fit}
+    if options.save and "network" in to_fit:
         card = {
             "command": "python -m benchmarks.learned_features --save jaxreg/dense/weights",
             "data": f"{options.shapes} procedural shapes, seed {options.seed}",
@@ -254,6 +254,8 @@ def main() -> None:
             "batch": options.batch,
         }
         save_weights(options.save, "features", trained["network"], _DENSE, card)
+    if "network" in trained:
+        trained["network, 1-NN"] = trained["network"]
     for label, chosen in clouds_to_test_on(options).items():
         for name, weights in trained.items():
             rows = test(search(name, weights), chosen, options)

@@ -44,7 +44,7 @@ def init_network(key: PRNGKeyArray) -> Network:
 
 
 def load_network() -> Network:
-    """The released weights (numpy arrays), which `register` uses."""
+    """The released weights (numpy arrays), for `register_dense`."""
     file = resources.files("jaxreg.dense") / "weights" / "features.npz"
     with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
