@@ -1,8 +1,8 @@
 """The traps of XLA:CPU, each taken and avoided: what the library does about them, in milliseconds.
 
-    python -m benchmarks.traps [--points 768] [--batch 8] [--only fusion search sum loop]
+    python -m benchmarks.traps [--points 768] [--batch 8] [--only forward search sum loop]
 
-`fusion`  the forward pass with the compiler's fusion of softmax and products, and without
+`forward` a batch pair by pair and at once, and with the compiler's fusion of softmax and products
 `search`  neighbours by one selection, by a selection that slices turn into a sort, by sorting rows
 `sum`     the neighbourhood sum and its gradient: row gathers in loops, indexing, 0/1 matrices
 `loop`    seconds to compile the gradient of the iterations as a loop, and written out
@@ -24,10 +24,11 @@ from jax.lax import Precision
 from benchmarks import timing, transcription, workload
 from jaxreg import matching, neighbors, rigid
 from jaxreg.compilation import jit
+from jaxreg.cpu import map_pairs
 from jaxreg.model import register_pair
 from jaxreg.types import RigidTransform
 
-GROUPS = ("fusion", "search", "sum", "loop")
+GROUPS = ("forward", "search", "sum", "loop")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,17 +41,21 @@ class Options:
     only: tuple[str, ...] = GROUPS
 
 
-def fusion(options: Options) -> dict[str, Callable]:
-    """The same function compiled with and without the library's compiler options."""
+def forward(options: Options) -> dict[str, Callable]:
+    """The same function with and without the library's compiler options, and as `vmap` has it."""
     variables, config = workload.released()
     clouds = [jnp.asarray(x) for x in workload.draw(options.points, options.batch)[:2]]
-    one = functools.partial(register_pair, config=config)
-    many = jax.vmap(one, in_axes=(None, 0, 0))
-    ours, default = jit(many), jax.jit(many)
-    return {
-        "forward pass, fusion off": lambda _: ours(variables, *clouds),
-        "forward pass, as jax.jit compiles it": lambda _: default(variables, *clouds),
+
+    def many(over_batch, variables, *clouds):
+        return over_batch(functools.partial(register_pair, variables, config=config))(*clouds)
+
+    loop, at_once = (functools.partial(many, way) for way in (map_pairs, jax.vmap))
+    programs = {
+        "forward pass, pair by pair": jit(loop),
+        "forward pass, the batch at once (vmap)": jit(at_once),
+        "forward pass, pair by pair, as jax.jit compiles it": jax.jit(loop),
     }
+    return {name: lambda _, f=program: f(variables, *clouds) for name, program in programs.items()}
 
 
 def search(options: Options) -> dict[str, Callable]:
@@ -139,7 +144,7 @@ def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     jax.config.update("jax_enable_compilation_cache", False)
     print(f"{options.points} points, batch {options.batch}; milliseconds a pair, fastest run")
-    for name, make in (("fusion", fusion), ("search", search), ("sum", sums)):
+    for name, make in (("forward", forward), ("search", search), ("sum", sums)):
         if name in options.only:
             taken = timing.alternate(make(options), rounds=options.rounds)
             show({k: 1e3 * t.minimum / options.batch for k, t in taken.items()}, "ms")

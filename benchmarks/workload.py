@@ -14,6 +14,7 @@ from benchmarks import transcription
 from jaxreg import training
 from jaxreg.compilation import jit
 from jaxreg.config import Config, PairConfig
+from jaxreg.cpu import map_pairs
 from jaxreg.data import shapes
 from jaxreg.model import register_pair
 from jaxreg.pretrained import load_pretrained
@@ -62,7 +63,7 @@ def _pair(rng: np.random.Generator, points: int) -> tuple[np.ndarray, ...]:
 def registration(implementation: Implementation, *, batched: bool) -> Callable:
     """The compiled function of variables and two clouds (n, 3), or two batches of them.
 
-    `jaxreg` is the library; `transcription` is the equations as one would first write them, compiled
+    `jaxreg` is the library, batches as `evaluate.py` takes them; `transcription` is the equations as one would first write them, compiled
     as `jax.jit` does by default.
     """
     _, config = released()
@@ -70,7 +71,10 @@ def registration(implementation: Implementation, *, batched: bool) -> Callable:
         compiler, one = jit, functools.partial(register_pair, config=config)
     else:
         compiler, one = jax.jit, functools.partial(transcription.register, config=config.model)
-    return compiler(jax.vmap(one, in_axes=(None, 0, 0)) if batched else one)
+    if not batched:
+        return compiler(one)
+    batch = map_pairs if implementation == "jaxreg" else jax.vmap
+    return compiler(lambda variables, *clouds: batch(functools.partial(one, variables))(*clouds))
 
 
 def training_config(points: int, batch: int) -> Config:

@@ -3,8 +3,12 @@
 Each was measured on jaxlib 0.10 (benchmarks/speed.py shows the stages); check again on a new one.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float, Shaped
 
 
@@ -60,3 +64,41 @@ def gradient_written_out(x: Shaped[Array, "*n c"]) -> Shaped[Array, "*n c"]:
 
     # Linear, with its transpose written out; see matching.neighborhood_sum.
     return jax.lax.custom_linear_solve(lambda x: x, x, solve=lambda _, x: x, transpose_solve=write)
+
+
+def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``jax.vmap(function)``; on a CPU a loop over the batch.
+
+    What one pair needs stays in the caches, where the arrays of a whole batch go through memory once
+    for every operation.
+    """
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)
+    return lambda *batch: jax.lax.map(lambda pair: function(*pair), batch)
+
+
+def one_at_a_time(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """``function(inputs, constants)`` whose `vmap`, and that of its gradient, is a loop over the batch.
+
+    For a part of a program whose other parts need the whole batch at once, as BatchNorm does; see
+    `map_pairs`. The gradient computes the function again, so that nothing but its arguments is kept.
+    Reverse mode only, and `constants` has no derivative. Off the CPU it is `function` itself.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+
+    # sequential_vmap alone knows forward mode only.
+    call = jax.custom_vjp(sequential_vmap(function))
+
+    @sequential_vmap
+    def pull_back(inputs, constants, cotangent):
+        return jax.vjp(lambda x: function(x, constants), inputs)[1](cotangent)[0]
+
+    def forward(inputs, constants):
+        return call(inputs, constants), (inputs, constants)
+
+    def backward(arguments, cotangent):
+        return pull_back(*arguments, cotangent), None
+
+    call.defvjp(forward, backward)
+    return call

@@ -15,6 +15,7 @@ from jaxtyping import Float, PRNGKeyArray
 from jaxreg import rigid
 from jaxreg.compilation import jit
 from jaxreg.config import ModelConfig, PairConfig, RefineConfig
+from jaxreg.cpu import map_pairs
 from jaxreg.data.pairs import make_pair, make_pair_from_scans
 from jaxreg.model import Variables, iterate
 from jaxreg.refine.gicp import gicp
@@ -145,7 +146,7 @@ def _register_batch(
             )
         return iterate(variables, source, reference, config=config)[0]
 
-    return jax.vmap(one)(pair.source, pair.reference)
+    return map_pairs(one)(pair.source, pair.reference)
 
 
 _register_batch_jit = jit(_register_batch, static_argnames=("config", "padded"))
@@ -177,7 +178,7 @@ def icp_method(pair: Pair) -> RigidTransform:
         source_mask=source.mask,
         reference_mask=reference.mask,
     )
-    return jax.vmap(one)(pair.source, pair.reference)
+    return map_pairs(one)(pair.source, pair.reference)
 
 
 def refined_method(method: Method, refine: Refinement) -> Method:
@@ -204,7 +205,7 @@ def refinement(config: RefineConfig) -> Refinement:
         masks = {"source_mask": source.mask, "reference_mask": reference.mask}
         return refine(source.points, reference.points, initial=initial, **masks, **options)
 
-    refine_batch = jit(jax.vmap(one))
+    refine_batch = jit(map_pairs(one))
     return lambda pair, initial: refine_batch(pair.source, pair.reference, initial)
 
 

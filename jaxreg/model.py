@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg import matching_blocks, rigid
 from jaxreg.config import Config, ModelConfig
+from jaxreg.cpu import one_at_a_time
 from jaxreg.features import DGCNN, relative_neighbors
 from jaxreg.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.invariants import geometric_structure
@@ -35,6 +36,8 @@ from jaxreg.procrustes import robust_procrustes
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
 Variables = dict[str, Any]
+_MATCHES = "matches"
+"""Name of what the matching hands on, which a gradient keeps."""
 
 
 class Graph(NamedTuple):
@@ -150,7 +153,20 @@ def _both_features(variables, points, graph, mask, config, train):
     return (features, nearest), variables
 
 
-def _match(source_features, reference_features, source_graph, reference_graph, reference, config):
+def _match(features, source_graph, reference_graph, reference, config: ModelConfig, train: bool):
+    def match_pair(inputs, constants):
+        (source_features, reference_features, points), (source, reference, mask) = inputs, constants
+        cloud = PointCloud(points, mask)
+        return _match_pair(source_features, reference_features, source, reference, cloud, config)
+
+    run = one_at_a_time(match_pair) if train else match_pair
+    matches = run((*features, reference.points), (source_graph, reference_graph, reference.mask))
+    return jax.tree.map(lambda x: checkpoint_name(x, _MATCHES), matches)
+
+
+def _match_pair(
+    source_features, reference_features, source_graph, reference_graph, reference, config
+) -> Matches:
     if source_features[0].shape[0] * reference_features[0].shape[0] > matching_blocks.LARGEST:
         features, graphs = (source_features, reference_features), (source_graph, reference_graph)
         branches = _branches(features, graphs, config)
@@ -214,6 +230,9 @@ def iterate(
 ) -> tuple[RigidTransform, Any, Variables]:
     """N_l registration steps.
 
+    With `train`, BatchNorm takes its statistics over the `vmap` axis `features.BATCH_AXIS`, the
+    matching goes through the batch pair by pair, and only reverse mode differentiates it.
+
     Returns the transform from source to reference (the composition of the steps), what `observe`
     returned for each step and the source's graph, stacked, and the variables with updated statistics.
     """
@@ -234,9 +253,8 @@ def iterate(
         features, variables = _both_features(
             variables, points, source_graph, source.mask, config, train
         )
-        matches = _match(
-            features, reference_features, source_graph, reference_graph, reference, config
-        )
+        both = (features, reference_features)
+        matches = _match(both, source_graph, reference_graph, reference, config, train)
         structures = [_structure(x, source_graph.neighbors, config) for x in (points, matches.copy)]
         confidence, variables = _run(
             network, "inliers", variables, *structures, source.mask, train=train
@@ -248,9 +266,10 @@ def iterate(
         return (rigid.compose(motion, total), variables), seen
 
     start = (rigid.identity(source.points.dtype), variables)
-    # A step is computed again in the backward pass, but for the two maps that cost most: cheaper than
-    # writing out and reading back a dozen (n, m) arrays a step, and less than half of the memory.
-    kept = jax.checkpoint_policies.save_only_these_names(*KEPT)
+    # A step is computed again in the backward pass, but for its matches and the two maps that cost
+    # most: cheaper than writing out and reading back a dozen (n, m) arrays a step, and less than half
+    # of the memory. (In training the maps are not seen here: `one_at_a_time` computes them again.)
+    kept = jax.checkpoint_policies.save_only_these_names(*KEPT, _MATCHES)
     step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables

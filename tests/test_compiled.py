@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from benchmarks import transcription
-from jaxreg import inliers, matching, neighbors, scans, training
+from jaxreg import evaluation, inliers, matching, neighbors, scans, training
 from jaxreg.compilation import jit
 from jaxreg.config import from_dict
 from jaxreg.model import init_variables, register_pair
+from jaxreg.types import Pair, PointCloud, RigidTransform
 from tests.compiled import AS_USERS
 
 # Sizes that tell the arrays apart: N x M x K exceeds whatever the networks or a stack over the
@@ -100,13 +101,23 @@ def forward() -> str:
 
 
 @pytest.fixture(scope="module")
+def evaluated() -> str:
+    """A batch as `evaluate.py` takes it."""
+    variables = jax.eval_shape(lambda: init_variables(jax.random.key(0), CONFIG.model))
+    clouds = (PointCloud(array(BATCH, n, 3), array(BATCH, n, dtype=bool)) for n in (N, M))
+    pair = Pair(*clouds, RigidTransform(array(BATCH, 3, 3), array(BATCH, 3)))
+    run = functools.partial(evaluation._register_batch, config=CONFIG.model, padded=True)
+    return compiled(jit(run), variables, pair)
+
+
+@pytest.fixture(scope="module")
 def step() -> str:
     state = jax.eval_shape(lambda: training.create_train_state(CONFIG))
     run = jit(functools.partial(training.train_step, config=CONFIG), donate_argnums=0)
     return compiled(run, state, array(3, 192, 3))
 
 
-@pytest.fixture(params=["forward", "step"])
+@pytest.fixture(params=["forward", "evaluated", "step"])
 def program(request) -> str:
     return request.getfixturevalue(request.param)
 
@@ -155,6 +166,20 @@ def test_nothing_is_as_large_as_the_maps_times_the_neighbours(program):
     assert max(sizes(program)) < BATCH * N * M * K
 
 
+def exponentials(text: str) -> int:
+    """Size of the largest array whose exponential is taken: that of the matching maps."""
+    return max(max(sizes(x)) for x in results(text, "exponential"))
+
+
+def test_training_and_evaluation_match_one_pair_at_a_time(evaluated, step):
+    assert exponentials(evaluated) == N * M
+    assert exponentials(step) == N * N
+
+
+def test_the_maps_of_a_whole_batch_would_be_seen(forward):
+    assert exponentials(forward) == BATCH * N * M
+
+
 def test_an_array_over_maps_and_neighbours_would_be_seen():
     graphs = array(N, K, dtype=jnp.int32), array(M, K, dtype=jnp.int32)
     text = compiled(jit(transcription.neighborhood_sum), array(N, M), *graphs)
@@ -185,7 +210,7 @@ def derivative(of_sum):
 
 
 def test_no_derivative_scatters_into_a_map(step):
-    assert not wide_scatters(step, BATCH * N * N)
+    assert not wide_scatters(step, N * N)
     graphs = (jax.eval_shape(matching.incidence, array(n, K, dtype=jnp.int32)) for n in (N, M))
     text = compiled(derivative(matching.neighborhood_sum), array(N, M), *graphs)
     assert not results(text, "scatter")

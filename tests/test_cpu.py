@@ -1,11 +1,19 @@
 """The reformulations for XLA:CPU are identities, of any shape and dtype, in value and derivative."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.cpu import at_row_min, gradient_written_out, row_min, written_out
+from jaxreg.cpu import (
+    at_row_min,
+    gradient_written_out,
+    map_pairs,
+    one_at_a_time,
+    row_min,
+    written_out,
+)
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 7, 16, 33, 50])
@@ -42,3 +50,45 @@ def test_a_gradient_written_out_is_the_gradient(seed):
     np.testing.assert_allclose(jax.jit(jax.grad(value))(x), np.cos(x) * target, atol=1e-15)
     derivative = jax.jit(lambda x, t: jax.jvp(value, (x,), (t,))[1])(x, tangent)
     np.testing.assert_allclose(derivative, np.sum(np.cos(x) * target * tangent), rtol=1e-12)
+
+
+def smooth(inputs, constants):
+    """A function of one pair, with inputs and results of several shapes and an integer constant."""
+    x, y = inputs
+    return {"map": jnp.sin(x) @ y.T, "sum": jnp.sum(x[constants] * y[constants] ** 2, axis=0)}
+
+
+def batch_of_pairs(seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(2, 4, 6, 3))
+    return (jnp.asarray(x), jnp.asarray(y)), jnp.asarray(rng.integers(0, 6, (4, 5)))
+
+
+def test_pairs_in_a_loop_give_what_vmap_gives(seed):
+    inputs, constants = batch_of_pairs(seed)
+    expected = jax.vmap(smooth)(inputs, constants)
+    for form in (map_pairs(smooth), jax.vmap(one_at_a_time(smooth))):
+        chex.assert_trees_all_close(jax.jit(form)(inputs, constants), expected, rtol=1e-12)
+    one = jax.tree.map(lambda x: x[0], (inputs, constants))
+    chex.assert_trees_all_close(one_at_a_time(smooth)(*one), smooth(*one), rtol=1e-12)
+
+
+@pytest.mark.parametrize("shared", ["nothing", "reference", "constants"])
+def test_so_does_their_gradient_where_vmap_shares_arguments_too(seed, shared):
+    inputs, constants = batch_of_pairs(seed)
+    axes = ((0, 0), 0)
+    if shared == "reference":
+        inputs, axes = (inputs[0], inputs[1][0]), ((0, None), 0)
+    if shared == "constants":
+        constants, axes = constants[0], ((0, 0), None)
+
+    def gradient(function):
+        def loss(inputs):
+            result = jax.vmap(function, in_axes=axes)(inputs, constants)
+            return sum(jnp.sum(jnp.cos(x)) for x in result.values())
+
+        return jax.jit(jax.grad(loss))(inputs)
+
+    chex.assert_trees_all_close(
+        gradient(one_at_a_time(smooth)), gradient(smooth), rtol=1e-12, atol=1e-14
+    )
