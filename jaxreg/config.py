@@ -283,8 +283,10 @@ class DenseConfig:
     """Variance across a surface, in units of the variance along it."""
     final_iterations: int = 15
     """Iterations of generalised ICP on the best pose,"""
-    final_reach: float = 0.1
+    final_reach: float = 0.06
     """the largest distance of its pairs,"""
+    final_partners: int = 2
+    """the points that every point is paired with,"""
     final_anneal: float = 8.0
     """how many times wider its kernel is in the first iteration than in the last,"""
     final_neighbors: int = 16
@@ -294,7 +296,8 @@ class DenseConfig:
     plane_width: float = 0.02
     """Width of the distance from the other surface's plane at which they match."""
     dense_spacing: float = 0.035
-    """Mean distance to the nearest point above which both of these widths grow in proportion."""
+    """Mean distance to the nearest point above which both of these widths, and the reach of the last
+    refinement, grow in proportion."""
     rim_radius: float = 0.3
     """Radius at which a surface is seen to be open."""
     rim: float = 0.25

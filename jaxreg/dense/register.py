@@ -19,10 +19,11 @@ from jaxreg.dense.moments import Descriptors, moment_descriptors, openness, stan
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
 from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
-from jaxreg.neighbors import squared_distances
+from jaxreg.neighbors import knn, squared_distances
 from jaxreg.numerics import safe_sqrt
 from jaxreg.refine import frame
 from jaxreg.refine.gicp import gicp
+from jaxreg.refine.normals import surface_covariances
 from jaxreg.types import Registration, RigidTransform
 
 _DEFAULT = DenseConfig()
@@ -63,17 +64,29 @@ def register_dense(
     where, x, y = enter(source, reference, source_mask, reference_mask, config)
     found = _search(x, y, source_mask, reference_mask, network, similarity, config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
+    masks = source_mask, reference_mask
+    neighbors = min(config.final_neighbors, min(len(x), len(y)) - 1)
+    source_covariances, reference_covariances = (
+        surface_covariances(p, knn(p, neighbors, mask), mask, thickness=config.thickness)
+        for p, mask in zip((x, y), masks, strict=True)
+    )
+    widening = _widening(
+        *(_spacing(p, mask) for p, mask in zip((x, y), masks, strict=True)), config
+    )
     pose = gicp(
         x,
         y,
+        source_covariances=source_covariances,
+        reference_covariances=reference_covariances,
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
         iterations=config.final_iterations,
-        max_distance=config.final_reach,
+        max_distance=config.final_reach * jax.lax.stop_gradient(widening),
         anneal=config.final_anneal,
         both_directions=True,
-        neighbors=min(config.final_neighbors, min(len(x), len(y)) - 1),
+        neighbors=neighbors,
+        partners=config.final_partners,
         thickness=config.thickness,
     )
     return _registration(where, pose, x, y, source_mask, reference_mask, config)
@@ -180,7 +193,7 @@ def _search(
     fine = lambda pose: align_fine(  # noqa: E731
         pose, few, fewer, config.fine_widths, thickness=config.thickness
     )
-    widening = _widening(source, reference, config)
+    widening = _widening(*(_spacing(s.points, s.mask) for s in (source, reference)), config)
     poses = _shortlist(jax.vmap(coarse)(poses), source, reference, grids, widening, config)
     poses = jax.lax.map(fine, poses)
     return _ranked(poses, source, reference, widening, largest_angle, config)
@@ -305,19 +318,19 @@ def _score(found: Evidence, config: DenseConfig) -> Float[Array, "s"]:
     return plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
 
 
-def _widening(source: Surface, reference: Surface, config: DenseConfig) -> Float[Array, ""]:
-    """Points of sparse clouds are beside each other although their surfaces match."""
-    sparse = jnp.maximum(_spacing(source), _spacing(reference)) / config.dense_spacing
-    return jnp.maximum(sparse, 1)
+def _widening(source: Array, reference: Array, config: DenseConfig) -> Float[Array, ""]:
+    """Points of sparse clouds (two spacings) are beside each other although their surfaces match."""
+    return jnp.maximum(jnp.maximum(source, reference) / config.dense_spacing, 1)
 
 
-def _spacing(surface: Surface) -> Float[Array, ""]:
+def _spacing(points: Array, mask: Array | None) -> Float[Array, ""]:
     """Mean distance from a point to the nearest other one."""
-    squared = squared_distances(surface.points, surface.points)
-    other = surface.mask[None, :] & ~jnp.eye(len(surface.mask), dtype=bool)
+    mask = jnp.ones(len(points), bool) if mask is None else mask
+    squared = squared_distances(points, points)
+    other = mask[None, :] & ~jnp.eye(len(mask), dtype=bool)
     nearest = safe_sqrt(jnp.min(jnp.where(other, squared, 4), axis=1))
-    count = jnp.maximum(jnp.sum(surface.mask), 1).astype(squared.dtype)
-    return jnp.sum(jnp.where(surface.mask, nearest, 0)) / count
+    count = jnp.maximum(jnp.sum(mask), 1).astype(squared.dtype)
+    return jnp.sum(jnp.where(mask, nearest, 0)) / count
 
 
 def _registration(

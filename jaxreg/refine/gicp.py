@@ -19,6 +19,7 @@ from jaxreg.refine.pairing import (
     closest_pairs,
     pair_weights,
     widenings,
+    with_neighbors,
 )
 from jaxreg.types import RigidTransform
 
@@ -43,6 +44,7 @@ def gicp(
     both_directions: bool = _DEFAULT.both_directions,
     neighbors: int = _DEFAULT.neighbors,
     thickness: float = _DEFAULT.thickness,
+    partners: int = 1,
 ) -> RigidTransform:
     """The pose after a fixed number of Gauss-Newton steps on ``sum_i w_i r_i^T M_i r_i``.
 
@@ -50,26 +52,36 @@ def gicp(
     ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is the smallest
     variance of the covariances: a residual across two parallel surfaces then counts as its length.
     Covariances that are not given are those of planes: 1 along, `thickness` across, from
-    `neighbors` neighbours. `kernel` weighs ``sqrt(r^T M r)``; everything else is as for
-    `jaxreg.refine.icp.icp`.
+    `neighbors` neighbours. `kernel` weighs ``sqrt(r^T M r)``. With more than one of `partners`, a
+    point is also paired with the nearest neighbours of its partner, which averages the noise of
+    their planes. Everything else is as for `jaxreg.refine.icp.icp`.
 
     Raises:
       ValueError: a shape or an option is wrong, or a cloud has not more than `neighbors` points.
     """
     check_options(iterations=iterations, trim=trim, anneal=anneal)
+    if not 1 <= partners <= neighbors + 1:
+        raise ValueError(
+            f"partners = {partners}: choose 1 to neighbors + 1 = {neighbors + 1}, since the others "
+            "are neighbours of the first."
+        )
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
+    graphs = knn(x, neighbors, source_mask), knn(y, neighbors, reference_mask)
     weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
     if source_covariances is None:
-        source_normals = normals(x, knn(x, neighbors, source_mask), source_mask)
+        source_normals = normals(x, graphs[0], source_mask)
         source_covariances = plane_covariances(source_normals, thickness)
     if reference_covariances is None:
-        reference_normals = normals(y, knn(y, neighbors, reference_mask), reference_mask)
+        reference_normals = normals(y, graphs[1], reference_mask)
         reference_covariances = plane_covariances(reference_normals, thickness)
 
     def step(pose: RigidTransform, widening: Array):
         pairs = closest_pairs(
             rigid.apply(pose, x), y, source_mask, reference_mask, both_directions=both_directions
         )
+        if partners > 1:
+            near = (graph[:, : partners - 1] for graph in graphs)
+            pairs = with_neighbors(pairs, *near, forward=x.shape[0])
         return gicp_step(
             pose,
             x,

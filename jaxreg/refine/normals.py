@@ -1,15 +1,20 @@
 """Normals and plane-like covariances of a cloud, by the principal components of neighbourhoods."""
 
+import jax
 import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg import symmetric
 from jaxreg.neighbors import without_padding
+from jaxreg.numerics import safe_norm
 
 _SMALLEST_GAP = 1e-3
 """Least difference of the two smaller eigenvalues, over the sum of all three, at which a
 neighbourhood has a normal. Noise of float32 is far below, a plane far above."""
+_OPEN, _OPEN_WIDTH = 0.4, 0.03
+"""Mean offset of the neighbours along the surface, over their mean distance, at which an edge begins.
+Half a disc has 0.64, a whole one of 16 random points 0.27 by chance."""
 
 
 def neighborhood_covariances(
@@ -56,6 +61,38 @@ def plane_covariances(unit_normals: Float[Array, "n 3"], thickness: float) -> Fl
     """
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
     return jnp.eye(3, dtype=outer.dtype)[None] - (1 - thickness) * outer
+
+
+def surface_covariances(
+    points: Float[Array, "n 3"],
+    neighbors: Int[Array, "n k"],
+    mask: Bool[Array, "n"] | None = None,
+    *,
+    thickness: float,
+) -> Float[Array, "n 3 3"]:
+    """`plane_covariances` that end where the surface does: `thickness` across its edge, too.
+
+    On the edge of a plate the neighbours lie on one side. There the distance to the edge says where
+    the point is, and of two plates nothing else says how far one has slid along the other. An edge
+    is met by an edge only: a point whose partner lies inside a surface is as free as before.
+    """
+    unit_normals = normals(points, neighbors, mask)
+    points = without_padding(points, mask)
+    own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
+    counts = neighbors != own
+    if mask is not None:
+        counts = counts & mask[:, None]
+    edges = jnp.where(counts[..., None], points[neighbors] - points[:, None, :], 0)
+    across = jnp.sum(edges * unit_normals[:, None, :], axis=-1, keepdims=True)
+    along = edges - across * unit_normals[:, None, :]
+    inward = jnp.sum(along, axis=1)
+    length, total = safe_norm(inward), jnp.sum(safe_norm(along), axis=1)
+    openness = length / jnp.where(total > 0, total, 1)
+    share = jax.nn.sigmoid((openness - _OPEN) / _OPEN_WIDTH)
+    inward = inward / jnp.where(length > 0, length, 1)[:, None]
+    outer = inward[:, :, None] * inward[:, None, :]
+    planes = plane_covariances(unit_normals, thickness)
+    return planes - ((1 - thickness) * share)[:, None, None] * outer
 
 
 def smallest_eigenvector(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:

@@ -68,6 +68,32 @@ def closest_pairs(
     )
 
 
+def with_neighbors(
+    pairs: Pairs,
+    source_neighbors: Int[Array, "n k"],
+    reference_neighbors: Int[Array, "m k"],
+    *,
+    forward: int,
+) -> Pairs:
+    """`pairs`, and those of the same points with the neighbours of their partners.
+
+    Several planes of a noisy surface agree on where it is better than one does. The first `forward`
+    pairs are those of the source's points, the others of the reference's.
+    """
+    source, reference = pairs.source_index, pairs.reference_index
+    k = source_neighbors.shape[1]
+    near_reference = reference_neighbors[reference[:forward]]
+    near_source = source_neighbors[source[forward:]]
+    again = lambda index: jnp.repeat(index[:, None], k, axis=1)  # noqa: E731
+    more_source = jnp.concatenate([again(source[:forward]), near_source])
+    more_reference = jnp.concatenate([near_reference, again(reference[forward:])])
+    return Pairs(
+        jnp.concatenate([source, more_source.ravel()]),
+        jnp.concatenate([reference, more_reference.ravel()]),
+        jnp.concatenate([pairs.mask, again(pairs.mask).ravel()]),
+    )
+
+
 def pair_weights(
     squared_distance: Float[Array, "p"],
     squared_residual: Float[Array, "p"],
