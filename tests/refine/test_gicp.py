@@ -1,5 +1,6 @@
 """Generalised ICP against a general minimiser, small_gicp and Open3D."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tests.compiled import gicp, icp, point_to_plane
+from tests.compiled import gicp, icp, knn, point_to_plane, surface_covariances
 
 
 def make_pair(seed, n=600, noise=0.002):
@@ -51,6 +52,37 @@ def test_fixed_point_minimises_the_mahalanobis_distances(seed):
 
     best = minimize(cost, np.zeros(6), tol=1e-14)
     np.testing.assert_allclose(best.x, 0, atol=1e-5)
+
+
+def test_edges_stop_a_plate_from_sliding(seed):
+    """Planes see little of a slide along them; the edges of two samplings of a plate do."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 1, (2, 8, 400, 3)) * [1, 1, 0]
+    offset = np.array([0.03, -0.02, 0.01])
+    options = {"both_directions": True, "max_distance": 0.06, "thickness": 0.01, "neighbors": 16}
+    options |= {"partners": 2, "iterations": 10}
+
+    def slides(edges):
+        def one(x, y):
+            found = [surface_covariances(p, knn(p, 16), thickness=0.01) for p in (x, y)]
+            names = ("source_covariances", "reference_covariances") if edges else ()
+            covariances = dict(zip(names, found, strict=False))
+            return gicp(x, y, **covariances, **options)
+
+        pose = jax.lax.map(lambda pair: one(*pair), (jnp.asarray(x + offset), jnp.asarray(y)))
+        centre = x.mean(axis=1) + offset
+        rotation, translation = map(np.asarray, pose)
+        moved = np.einsum("bij,bj->bi", rotation, centre) + translation
+        return np.linalg.norm(moved - centre + offset, axis=1)
+
+    assert np.mean(slides(edges=True)) < 0.7 * np.mean(slides(edges=False))
+
+
+@pytest.mark.parametrize("partners", [0, 12])
+def test_partners_that_are_no_neighbours_are_refused(partners):
+    x = jnp.zeros((20, 3))
+    with pytest.raises(ValueError, match=f"partners = {partners}: choose 1 to neighbors"):
+        gicp(x, x, partners=partners)
 
 
 def test_isotropic_covariances_make_it_point_to_point(seed):

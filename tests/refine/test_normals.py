@@ -10,7 +10,7 @@ from jaxreg.refine.normals import (
     plane_covariances,
     smallest_eigenvector,
 )
-from tests.compiled import knn, neighborhood_covariances, normals
+from tests.compiled import knn, neighborhood_covariances, normals, surface_covariances
 
 
 def surface(seed, n=60):
@@ -46,6 +46,39 @@ def test_plane_covariances_have_the_given_thickness(seed):
     np.testing.assert_allclose(result @ normal, 1e-3 * normal, atol=1e-15)
     np.testing.assert_allclose(np.linalg.eigvalsh(result), [1e-3, 1, 1])
     np.testing.assert_array_equal(plane_covariances(jnp.zeros((1, 3)), 1e-3)[0], np.eye(3))
+
+
+def plate(side=13):
+    """A square of side 1 in the plane z = 0, a regular grid without ties, and where its edges are."""
+    steps = np.linspace(0, 1, side)
+    x, y = (v.ravel() for v in np.meshgrid(steps, 1.01 * steps, indexing="ij"))
+    inside = (x > 0.2) & (x < 0.8) & (y > 0.2) & (y < 0.8)
+    middle = (abs(y - 0.505) < 0.1) & ((x == 0) | (x == 1))
+    return np.column_stack([x, y, 0 * x]), inside, middle
+
+
+def test_a_surface_ends_at_its_edge(seed):
+    """Inside, the covariance is that of a plane; on an edge it is thin across the edge as well."""
+    points, inside, middle = plate()
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    neighbors = knn(jnp.asarray(points @ turn.T), 24)
+    result = surface_covariances(jnp.asarray(points @ turn.T), neighbors, thickness=0.01)
+    result = turn.T @ result @ turn
+    expected = np.broadcast_to(np.diag([1, 1, 0.01]), result[inside].shape)
+    np.testing.assert_allclose(result[inside], expected, atol=1e-4)
+    expected = np.broadcast_to(np.diag([0.01, 1, 0.01]), result[middle].shape)
+    np.testing.assert_allclose(result[middle], expected, atol=0.1)
+
+
+def test_padding_changes_no_surface():
+    points, _, _ = plate()
+    padded = np.concatenate([points, np.full((3, 3), np.nan)])
+    mask = np.arange(len(padded)) < len(points)
+    neighbors = knn(jnp.asarray(padded), 8, jnp.asarray(mask))
+    result = surface_covariances(jnp.asarray(padded), neighbors, jnp.asarray(mask), thickness=0.01)
+    alone = surface_covariances(jnp.asarray(points), knn(jnp.asarray(points), 8), thickness=0.01)
+    np.testing.assert_allclose(result[: len(points)], alone, atol=1e-12)
+    assert np.isfinite(result).all()
 
 
 def test_derivative_equals_finite_differences(seed):

@@ -13,6 +13,7 @@ from jaxreg.refine.pairing import (
     masked_quantile,
     pair_weights,
     widenings,
+    with_neighbors,
 )
 from tests.compiled import closest_pairs
 
@@ -26,6 +27,25 @@ def test_pairs_equal_the_tree(seed):
     np.testing.assert_array_equal(pairs.source_index[30:], cKDTree(x).query(y)[1])
     np.testing.assert_array_equal(pairs.reference_index[30:], np.arange(40))
     assert pairs.mask.all()
+
+
+@pytest.mark.parametrize("both_directions", [False, True])
+def test_neighbours_of_partners_equal_the_loop(seed, both_directions):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(6, 3)), rng.normal(size=(5, 3))
+    near_x, near_y = (rng.integers(0, n, (n, 2), dtype=np.int32) for n in (6, 5))
+    mask = jnp.asarray(np.arange(6) != 2)
+    pairs = closest_pairs(
+        jnp.asarray(x), jnp.asarray(y), mask, None, both_directions=both_directions
+    )
+    result = with_neighbors(pairs, jnp.asarray(near_x), jnp.asarray(near_y), forward=6)
+    expected = []
+    for number, (i, j, counts) in enumerate(zip(*map(np.asarray, pairs), strict=True)):
+        more = [(i, other) for other in near_y[j]] if number < 6 else [(k, j) for k in near_x[i]]
+        expected += [(*pair, counts) for pair in [(i, j), *more]]
+    assert sorted(zip(*map(np.ndarray.tolist, map(np.asarray, result)), strict=True)) == sorted(
+        expected
+    )
 
 
 def test_padding_is_in_no_pair(seed):

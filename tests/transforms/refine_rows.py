@@ -95,6 +95,11 @@ def small_parts() -> dict[str, Row]:
         "normals.plane_covariances": Row(
             functools.partial(normals.plane_covariances, thickness=0.01), (points(),)
         ),
+        "normals.surface_covariances": Row(
+            functools.partial(normals.surface_covariances, thickness=0.01),
+            (points() * [1.0, 1.0, 0.1], graph),
+            every(lambda x: (x, graph)),
+        ),
         "normals.smallest_eigenvector": Row(
             lambda m: jnp.abs(normals.smallest_eigenvector(m)),
             (np.diag([1.0, 2.0, 4.0]) + 0.1 * np.ones((3, 3)),),
@@ -102,6 +107,13 @@ def small_parts() -> dict[str, Row]:
         ),
         "pairing.closest_pairs": Row(
             closest, (points(), points(5)), every(lambda x: (x, x)), smooth=False
+        ),
+        "pairing.with_neighbors": Row(
+            lambda x, y: pairing.with_neighbors(
+                closest(x, y), jnp.asarray(graph), jnp.asarray(graph % 5), forward=N
+            ),
+            (points(), points(5)),
+            smooth=False,
         ),
         "pairing.pair_weights": Row(
             weights,
