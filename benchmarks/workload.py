@@ -63,8 +63,8 @@ def _pair(rng: np.random.Generator, points: int) -> tuple[np.ndarray, ...]:
 def registration(implementation: Implementation, *, batched: bool) -> Callable:
     """The compiled function of variables and two clouds (n, 3), or two batches of them.
 
-    `jaxreg` is the library, batches as `evaluate.py` takes them; `transcription` is the equations as one would first write them, compiled
-    as `jax.jit` does by default.
+    `jaxreg` is the library, with batches as `evaluate.py` takes them; `transcription` is the equations
+    as one would first write them, compiled as `jax.jit` does by default.
     """
     _, config = released()
     if implementation == "jaxreg":

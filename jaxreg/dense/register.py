@@ -319,7 +319,7 @@ def _score(found: Evidence, config: DenseConfig) -> Float[Array, "s"]:
 
 
 def _widening(source: Array, reference: Array, config: DenseConfig) -> Float[Array, ""]:
-    """Points of sparse clouds (two spacings) are beside each other although their surfaces match."""
+    """How much farther apart than in dense clouds the points of matching surfaces lie."""
     return jnp.maximum(jnp.maximum(source, reference) / config.dense_spacing, 1)
 
 

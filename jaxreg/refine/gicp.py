@@ -57,7 +57,8 @@ def gicp(
     their planes. Everything else is as for `jaxreg.refine.icp.icp`.
 
     Raises:
-      ValueError: a shape or an option is wrong, or a cloud has not more than `neighbors` points.
+      ValueError: a shape or an option is wrong, or a cloud whose neighbours are needed has not more
+        than `neighbors` points.
     """
     check_options(iterations=iterations, trim=trim, anneal=anneal)
     if not 1 <= partners <= neighbors + 1:
@@ -66,7 +67,13 @@ def gicp(
             "are neighbours of the first."
         )
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
-    graphs = knn(x, neighbors, source_mask), knn(y, neighbors, reference_mask)
+    graphs = [
+        knn(cloud, neighbors, mask) if covariances is None or partners > 1 else None
+        for cloud, mask, covariances in (
+            (x, source_mask, source_covariances),
+            (y, reference_mask, reference_covariances),
+        )
+    ]
     weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
     if source_covariances is None:
         source_normals = normals(x, graphs[0], source_mask)

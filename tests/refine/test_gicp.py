@@ -78,6 +78,15 @@ def test_edges_stop_a_plate_from_sliding(seed):
     assert np.mean(slides(edges=True)) < 0.7 * np.mean(slides(edges=False))
 
 
+def test_given_covariances_need_no_neighbours():
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+    planes = jnp.tile(jnp.diag(jnp.array([1.0, 1.0, 0.01])), (4, 1, 1))
+    pose = gicp(x, x, source_covariances=planes, reference_covariances=planes)
+    np.testing.assert_allclose(pose.rotation, np.eye(3), atol=1e-12)
+    with pytest.raises(ValueError, match="k = 10 neighbours do not exist"):
+        gicp(x, x, source_covariances=planes, reference_covariances=planes, partners=2)
+
+
 @pytest.mark.parametrize("partners", [0, 12])
 def test_partners_that_are_no_neighbours_are_refused(partners):
     x = jnp.zeros((20, 3))
