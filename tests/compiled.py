@@ -28,7 +28,9 @@ surface_covariances = jax.jit(_normals.surface_covariances, static_argnames="thi
 neighborhood_covariances = jax.jit(_normals.neighborhood_covariances)
 icp = jax.jit(_icp.icp, static_argnames=_SOLVER)
 point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames=(*_SOLVER, "neighbors"))
-gicp = jax.jit(_gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness", "partners"))
+gicp = jax.jit(
+    _gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness", "partners", "edges")
+)
 moment_descriptors = jax.jit(moments.moment_descriptors, static_argnames=("radii", "normal_radius"))
 standardized = jax.jit(moments.standardized)
 openness = jax.jit(moments.openness, static_argnames="radius")

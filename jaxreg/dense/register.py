@@ -19,11 +19,10 @@ from jaxreg.dense.moments import Descriptors, moment_descriptors, openness, stan
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
 from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
-from jaxreg.neighbors import knn, squared_distances
+from jaxreg.neighbors import squared_distances
 from jaxreg.numerics import safe_sqrt
 from jaxreg.refine import frame
 from jaxreg.refine.gicp import gicp
-from jaxreg.refine.normals import surface_covariances
 from jaxreg.types import Registration, RigidTransform
 
 _DEFAULT = DenseConfig()
@@ -64,20 +63,10 @@ def register_dense(
     where, x, y = enter(source, reference, source_mask, reference_mask, config)
     found = _search(x, y, source_mask, reference_mask, network, similarity, config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
-    masks = source_mask, reference_mask
-    neighbors = min(config.final_neighbors, min(len(x), len(y)) - 1)
-    source_covariances, reference_covariances = (
-        surface_covariances(p, knn(p, neighbors, mask), mask, thickness=config.thickness)
-        for p, mask in zip((x, y), masks, strict=True)
-    )
-    widening = _widening(
-        *(_spacing(p, mask) for p, mask in zip((x, y), masks, strict=True)), config
-    )
+    widening = _widening(x, y, source_mask, reference_mask, config)
     pose = gicp(
         x,
         y,
-        source_covariances=source_covariances,
-        reference_covariances=reference_covariances,
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
@@ -85,9 +74,10 @@ def register_dense(
         max_distance=config.final_reach * jax.lax.stop_gradient(widening),
         anneal=config.final_anneal,
         both_directions=True,
-        neighbors=neighbors,
-        partners=config.final_partners,
+        neighbors=min(config.final_neighbors, min(len(x), len(y)) - 1),
         thickness=config.thickness,
+        partners=config.final_partners,
+        edges=True,
     )
     return _registration(where, pose, x, y, source_mask, reference_mask, config)
 
@@ -193,7 +183,7 @@ def _search(
     fine = lambda pose: align_fine(  # noqa: E731
         pose, few, fewer, config.fine_widths, thickness=config.thickness
     )
-    widening = _widening(*(_spacing(s.points, s.mask) for s in (source, reference)), config)
+    widening = _widening(x, y, source_mask, reference_mask, config)
     poses = _shortlist(jax.vmap(coarse)(poses), source, reference, grids, widening, config)
     poses = jax.lax.map(fine, poses)
     return _ranked(poses, source, reference, widening, largest_angle, config)
@@ -318,9 +308,10 @@ def _score(found: Evidence, config: DenseConfig) -> Float[Array, "s"]:
     return plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
 
 
-def _widening(source: Array, reference: Array, config: DenseConfig) -> Float[Array, ""]:
+def _widening(x, y, source_mask, reference_mask, config: DenseConfig) -> Float[Array, ""]:
     """How much farther apart than in dense clouds the points of matching surfaces lie."""
-    return jnp.maximum(jnp.maximum(source, reference) / config.dense_spacing, 1)
+    sparse = jnp.maximum(_spacing(x, source_mask), _spacing(y, reference_mask))
+    return jnp.maximum(sparse / config.dense_spacing, 1)
 
 
 def _spacing(points: Array, mask: Array | None) -> Float[Array, ""]:

@@ -10,7 +10,7 @@ from jaxreg.config import RefineConfig
 from jaxreg.neighbors import knn
 from jaxreg.refine import frame
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import normals, plane_covariances
+from jaxreg.refine.normals import normals, plane_covariances, surface_covariances
 from jaxreg.refine.pairing import (
     Kernel,
     Pairs,
@@ -45,6 +45,7 @@ def gicp(
     neighbors: int = _DEFAULT.neighbors,
     thickness: float = _DEFAULT.thickness,
     partners: int = 1,
+    edges: bool = False,
 ) -> RigidTransform:
     """The pose after a fixed number of Gauss-Newton steps on ``sum_i w_i r_i^T M_i r_i``.
 
@@ -52,7 +53,8 @@ def gicp(
     ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is the smallest
     variance of the covariances: a residual across two parallel surfaces then counts as its length.
     Covariances that are not given are those of planes: 1 along, `thickness` across, from
-    `neighbors` neighbours. `kernel` weighs ``sqrt(r^T M r)``. With more than one of `partners`, a
+    `neighbors` neighbours; with `edges`, of surfaces that end (`normals.surface_covariances`).
+    `kernel` weighs ``sqrt(r^T M r)``. With more than one of `partners`, a
     point is also paired with the nearest neighbours of its partner, which averages the noise of
     their planes. Everything else is as for `jaxreg.refine.icp.icp`.
 
@@ -67,28 +69,27 @@ def gicp(
             "are neighbours of the first."
         )
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
-    graphs = [
-        knn(cloud, neighbors, mask) if covariances is None or partners > 1 else None
-        for cloud, mask, covariances in (
-            (x, source_mask, source_covariances),
-            (y, reference_mask, reference_covariances),
-        )
-    ]
     weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
-    if source_covariances is None:
-        source_normals = normals(x, graphs[0], source_mask)
-        source_covariances = plane_covariances(source_normals, thickness)
-    if reference_covariances is None:
-        reference_normals = normals(y, graphs[1], reference_mask)
-        reference_covariances = plane_covariances(reference_normals, thickness)
+
+    def described(cloud, mask, covariances):
+        if covariances is not None and partners == 1:
+            return None, covariances
+        graph = knn(cloud, neighbors, mask)
+        if covariances is None and edges:
+            covariances = surface_covariances(cloud, graph, mask, thickness=thickness)
+        elif covariances is None:
+            covariances = plane_covariances(normals(cloud, graph, mask), thickness)
+        return graph[:, : partners - 1], covariances
+
+    near_source, source_covariances = described(x, source_mask, source_covariances)
+    near_reference, reference_covariances = described(y, reference_mask, reference_covariances)
 
     def step(pose: RigidTransform, widening: Array):
         pairs = closest_pairs(
             rigid.apply(pose, x), y, source_mask, reference_mask, both_directions=both_directions
         )
         if partners > 1:
-            near = (graph[:, : partners - 1] for graph in graphs)
-            pairs = with_neighbors(pairs, *near, forward=x.shape[0])
+            pairs = with_neighbors(pairs, near_source, near_reference, forward=x.shape[0])
         return gicp_step(
             pose,
             x,

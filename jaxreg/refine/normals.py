@@ -25,18 +25,23 @@ def neighborhood_covariances(
     `neighbors` are rows of `points`, as `jaxreg.knn` gives them; a point that fills its own list
     counts once. Padded rows give zero.
     """
+    edges, weight = _edges(points, neighbors, mask)
+    total = jnp.maximum(jnp.sum(weight, axis=1), 1)
+    centred = (edges - (jnp.sum(weight * edges, axis=1) / total)[:, None, :]) * weight
+    product = jnp.matmul(centred.mT, centred, precision=Precision.HIGHEST)
+    return product / total[..., None]
+
+
+def _edges(points, neighbors, mask) -> tuple[Array, Array]:
+    """From every point to itself and its neighbours (n, k + 1, 3); 1 where one counts, else 0."""
     points = without_padding(points, mask)
     own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
     counts = jnp.concatenate([jnp.ones_like(own, bool), neighbors != own], axis=1)
     if mask is not None:
         counts = counts & mask[:, None]
-    weight = counts.astype(points.dtype)[..., None]
-    total = jnp.maximum(jnp.sum(weight, axis=1), 1)
     # Relative to the point itself: the mean of near points loses no digits to a far origin.
     edges = points[jnp.concatenate([own, neighbors], axis=1)] - points[:, None, :]
-    centred = (edges - (jnp.sum(weight * edges, axis=1) / total)[:, None, :]) * weight
-    product = jnp.matmul(centred.mT, centred, precision=Precision.HIGHEST)
-    return product / total[..., None]
+    return edges, counts.astype(points.dtype)[..., None]
 
 
 def normals(
@@ -77,12 +82,8 @@ def surface_covariances(
     is met by an edge only: a point whose partner lies inside a surface is as free as before.
     """
     unit_normals = normals(points, neighbors, mask)
-    points = without_padding(points, mask)
-    own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
-    counts = neighbors != own
-    if mask is not None:
-        counts = counts & mask[:, None]
-    edges = jnp.where(counts[..., None], points[neighbors] - points[:, None, :], 0)
+    edges, weight = _edges(points, neighbors, mask)
+    edges = edges * weight
     across = jnp.sum(edges * unit_normals[:, None, :], axis=-1, keepdims=True)
     along = edges - across * unit_normals[:, None, :]
     inward = jnp.sum(along, axis=1)

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from tests.compiled import gicp, icp, knn, point_to_plane, surface_covariances
+from tests.compiled import gicp, icp, point_to_plane
 
 
 def make_pair(seed, n=600, noise=0.002):
@@ -63,13 +63,8 @@ def test_edges_stop_a_plate_from_sliding(seed):
     options |= {"partners": 2, "iterations": 10}
 
     def slides(edges):
-        def one(x, y):
-            found = [surface_covariances(p, knn(p, 16), thickness=0.01) for p in (x, y)]
-            names = ("source_covariances", "reference_covariances") if edges else ()
-            covariances = dict(zip(names, found, strict=False))
-            return gicp(x, y, **covariances, **options)
-
-        pose = jax.lax.map(lambda pair: one(*pair), (jnp.asarray(x + offset), jnp.asarray(y)))
+        one = lambda pair: gicp(*pair, edges=edges, **options)  # noqa: E731
+        pose = jax.lax.map(one, (jnp.asarray(x + offset), jnp.asarray(y)))
         centre = x.mean(axis=1) + offset
         rotation, translation = map(np.asarray, pose)
         moved = np.einsum("bij,bj->bi", rotation, centre) + translation
