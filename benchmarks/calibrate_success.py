@@ -124,6 +124,11 @@ def run(options: Options) -> list[dict]:
     return records
 
 
+def without_search(records: list[dict]) -> list[dict]:
+    """The same pairs as if their poses had been given: nothing is known of a rival."""
+    return [record | {"rival": verdict.NOT_SEARCHED} for record in records]
+
+
 def design(records: list[dict]) -> tuple[np.ndarray, np.ndarray]:
     """Inputs of the regression, and which poses are right."""
     found = [verdict.Evidence(*(r[n] for n in verdict.Evidence._fields)) for r in records]
@@ -184,12 +189,12 @@ def main(options: Options) -> None:
     records = run(options)
     if options.save:
         options.save.write_text(json.dumps(records))
-    report(records, None, "the library's constants")
-    if options.split == "train":
-        weights = fit(*design(records))
-        report(records, weights, "fitted on these pairs")
-        print(f"_INTERCEPT = {weights[0]:.2f}")
-        print(f"_COEFFICIENTS = np.array([{', '.join(f'{w:.2f}' for w in weights[1:])}])")
+    for name, known in (("_SEARCHED", records), ("_UNSEARCHED", without_search(records))):
+        report(known, None, f"the library's constants, {name}")
+        if options.split == "train":
+            weights = fit(*design(known))
+            report(known, weights, f"fitted on these pairs, {name}")
+            print(f"{name} = np.array([{', '.join(f'{w:.2f}' for w in weights)}])")
 
 
 if __name__ == "__main__":

@@ -196,7 +196,11 @@ def _check_place(path: Path, taken: Sequence[Path]) -> None:
 
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[Path]:
-    """A file to write to, which takes the place of `path` once it is complete."""
+    """A file to write to, which takes the place of `path` once it is complete.
+
+    Raises:
+      ValueError: it cannot be written there.
+    """
     if path.exists() and not path.is_file():  # A device or a pipe is written as it is.
         yield path
         return
@@ -204,8 +208,13 @@ def _whole(path: Path) -> Iterator[Path]:
     try:
         yield part
         part.replace(path.resolve())
+    except OSError as error:
+        raise ValueError(
+            f"{path} could not be written ({error.strerror or error}): choose another place."
+        ) from None
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # of a folder that is none, say
+            part.unlink(missing_ok=True)
 
 
 def _checked(path: Path, nonfinite: str) -> np.ndarray:
@@ -254,15 +263,9 @@ def _write_results(command: Register, source, reference, result) -> None:
         (command.plot, draw),
         (command.html, write_page),
     ):
-        if path is None:
-            continue
-        try:
+        if path is not None:
             with _whole(path) as part:
                 write(part)
-        except OSError as error:
-            raise ValueError(
-                f"{path} could not be written ({error.strerror or error}): choose another place."
-            ) from None
 
 
 def describe_file(command: Info) -> int:

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The network (METHOD: stages and readings)."""
+    """The network; where the paper can be read in several ways, a field says which is taken."""
 
     k: int = 5
     """K, neighbours of a point in the features and in the inlier module (self excluded)."""
@@ -87,7 +87,7 @@ class LossConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PairConfig:
-    """How two clouds to register are made from one shape (METHOD section 4)."""
+    """How two clouds to register are made from one shape."""
 
     points: int = 1024
     """Points taken from a shape before the crop."""
@@ -188,7 +188,7 @@ class RefineConfig:
     trim: float = 1.0
     """Share of the closest pairs that count."""
     kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "geman_mcclure"
-    """Robust weight of point-to-plane and generalised ICP; `icp` alone is plain unless told."""
+    """Robust weight of the pairs. (The function `icp` alone is plain unless told.)"""
     anneal: float = 10.0
     """How many times wider the kernel is in the first iteration than in the last."""
     both_directions: bool = False
@@ -197,6 +197,8 @@ class RefineConfig:
     """Neighbours of a point that its normal is computed from."""
     thickness: float = 1e-3
     """Variance across a surface, in units of the variance along it (generalised ICP)."""
+    edges: bool = False
+    """Surfaces end: their edges must meet, too (generalised ICP)."""
     weak_threshold: float = 0.01
     """A motion is weak when it changes the distances to the surfaces by a smaller mean square than
     this, for a motion of one (1/3 for surfaces that face all ways)."""
@@ -230,6 +232,10 @@ class RegisterConfig:
     """Neighbours of a point that its normal is computed from."""
     refine_thickness: float = 0.01
     """Variance across a surface, in units of the variance along it."""
+    refine_reach: float = 2.0
+    """Largest distance of its pairs, in spacings of the clouds that it has."""
+    refine_edges: bool = True
+    """Surfaces end, and where both do their edges must meet."""
 
 
 @dataclasses.dataclass(frozen=True)

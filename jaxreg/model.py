@@ -1,4 +1,4 @@
-"""The network: one registration step, and its iteration (METHOD stages 1 to N_l).
+"""The network: one registration step (Eq. 3 to 13 of the paper), and its iteration.
 
 ``variables = {"params": ..., "batch_stats": ...}`` is one plain dict, each with the keys `features`
 and `inliers`. Everything here is a pure function of one pair; a batch is the caller's `vmap`.

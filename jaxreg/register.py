@@ -17,7 +17,7 @@ from jaxreg.dense.register import search_dense
 from jaxreg.refine.host import Refined
 from jaxreg.refine.host import refine as refine_pose
 from jaxreg.refine.tree import IndexedCloud, index_cloud
-from jaxreg.refine.uncertainty import weak_directions
+from jaxreg.refine.uncertainty import PoseUncertainty, about, weak_directions
 from jaxreg.types import RigidTransform
 
 Rotation = Literal["limited", "full"]
@@ -42,10 +42,10 @@ class ScanRegistration(NamedTuple):
     of those points, `overlap` the share of both clouds within reach of the other, at equal density.
 
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
-    reference. `weak_directions` names the motions that the clouds hardly resist. `success` is False
-    when the pose should not be trusted, `probability` is the calibrated chance that it is right.
-    `evidence` is what that chance is computed from. `dropped` counts the non-finite rows of both
-    clouds.
+    reference's distinct points; NaN where nothing was refined or no surfaces were within reach.
+    `weak_directions` names the motions that the clouds hardly resist. `success` is False when the
+    pose should not be trusted, `probability` is the calibrated chance that it is right. `evidence`
+    is what that chance is computed from. `dropped` counts the non-finite rows of both clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -80,9 +80,10 @@ def register(
 
     Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit; neither their sizes nor
     their order nor their origin play a role. `initial` (4x4 or a `RigidTransform`) starts from a
-    known pose and skips the search. `rotation` says how far the clouds may be turned: "full" by
-    anything, "limited" by `config.limited_deg`, which settles symmetric shapes. `refine` None gives
-    the pose of the search. The same input gives the same bits.
+    known pose and skips the search, so that nothing is known of rival poses. `rotation` says how far
+    the clouds may be turned: "full" by anything, "limited" by `config.limited_deg`, which settles
+    symmetric shapes. `refine` None gives the pose of the search, or `initial`. The same input gives
+    the same bits.
 
     Raises:
       ValueError: a cloud is not numeric (n, 3) with three finite points or more (the message names
@@ -100,7 +101,7 @@ def register(
     if start is None:
         pose, rival = _searched(a, b, frame, rotation, config)
     else:
-        pose, rival = scans.pose_in(frame, start), verdict.NO_RIVAL
+        pose, rival = scans.pose_in(frame, start), verdict.NOT_SEARCHED
     refined = _refined(x, y, pose, refine, spacing, config)
     clouds = (_indexed(points, config) for points in (a, b))
     reach = config.reach * spacing
@@ -117,6 +118,9 @@ def _enough(points: np.ndarray, config: RegisterConfig) -> np.ndarray:
     return np.tile(points, (-(-(config.refine_neighbors + 1) // len(points)), 1))
 
 
+_UNREFINED = PoseUncertainty(
+    np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(()), np.zeros(()), np.zeros(3), np.ones(())
+)
 _LEAST = {
     "search_points": 16,
     "refine_points": 16,
@@ -135,6 +139,11 @@ def _check_options(rotation: str, refine: str | None, config: RegisterConfig) ->
         if not (least <= value < np.inf and value > 0):
             bound = f"at least {least}" if least else "positive"
             raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
+    if config.limited_deg > 180:
+        raise ValueError(
+            f"config.limited_deg must be at most 180, got {config.limited_deg}: choose "
+            "rotation='full' for clouds that may be turned by anything."
+        )
     if rotation not in ("limited", "full"):
         raise ValueError(f"rotation must be 'limited' or 'full', got {rotation!r}.")
     if refine not in ("gicp", "icp", "point_to_plane", None):
@@ -187,6 +196,9 @@ def _searched(
     best = int(np.argmax(score - _PREFERENCE * _angles(poses, np.eye(3)) / np.pi))
     apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
     others = (_angles(poses, poses.rotation[best]) > np.radians(15)) | (apart > 0.2)
+    # A pose that turns too far is no rival: it was ruled out, and its score says only that.
+    allowed = _angles(poses, np.eye(3)) <= np.radians(largest) + 1e-2
+    others &= allowed | ~allowed[best]
     lead = score[best] - score[others].max() if others.any() else verdict.NO_RIVAL
     return RigidTransform(poses.rotation[best], poses.translation[best]), float(lead)
 
@@ -215,20 +227,24 @@ def _angles(poses: RigidTransform, rotation: np.ndarray) -> Float[np.ndarray, "p
 
 
 def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> Refined:
-    """The pose refined with more points than the search had."""
+    """The pose refined with more points than the search had; without a method as it is."""
+    if method is None:
+        rotation = scans.nearest_rotation(pose.rotation)
+        return Refined(RigidTransform(rotation, pose.translation), 0, None, _UNREFINED)
     x, y = (_enough(scans.reduce_to(p, config.refine_points), config) for p in (x, y))
-    finer = min(spacing, max(scans.spacing(x), scans.spacing(y)))
+    finer = min(spacing, max(scans.spacing(x), scans.spacing(y), scans.FINEST))
     return refine_pose(
         x,
         y,
-        method=method or "icp",
+        method=method,
         initial=pose,
-        iterations=config.refine_iterations if method else 1,
-        max_distance=3 * finer if method else 0.0,
+        iterations=config.refine_iterations,
+        max_distance=config.refine_reach * finer,
         anneal=config.refine_anneal,
         both_directions=True,
         neighbors=config.refine_neighbors,
         thickness=config.refine_thickness,
+        edges=config.refine_edges,
         dense_limit=0,
     )
 
@@ -244,13 +260,18 @@ def _result(
     reach: float,
     begin: float,
 ) -> ScanRegistration:
-    inner = RigidTransform(scans.nearest_rotation(refined.transform.rotation), refined.transform[1])
+    inner = refined.transform
     pose = scans.pose_out(frame, inner)
     distance, index = scans.nearest(cKDTree(y), x @ inner.rotation.T + inner.translation)
     near = distance <= reach
     confidence = np.maximum(0, 1 - (distance / reach) ** 2) ** 2
     units = np.repeat([1.0, frame.length], 3)
     chance = verdict.probability(judged)
+    known = refined.uncertainty.weight > 0
+    centroid = np.zeros(3)  # of the whole reference, in the frame
+    covariance = (
+        about(refined.uncertainty, centroid).covariance if known else np.full((6, 6), np.nan)
+    )
     return ScanRegistration(
         rotation=pose.rotation,
         translation=pose.translation,
@@ -263,7 +284,7 @@ def _result(
         if near.any()
         else 0,
         overlap=judged.overlap,
-        covariance=refined.uncertainty.covariance * np.outer(units, units),
+        covariance=covariance * np.outer(units, units),
         weak_directions=tuple(d.name for d in weak_directions(refined.uncertainty)),
         success=chance >= verdict.TRUSTED,
         probability=chance,

@@ -14,7 +14,8 @@ from jaxreg.types import RigidTransform
 
 _LARGEST = 1e100
 """Coordinates beyond would overflow when squared."""
-_FINEST = 1e-6
+FINEST = 1e-6
+"""The resolution of float32 in a cloud of radius 1: a spacing below it is none."""
 _CUBES = 1 << 20
 """Up to so many cubes a table of all of them is quicker than to sort the occupied ones."""
 _FEWEST = 3
@@ -216,7 +217,7 @@ def at_one_density(
         if 1.3 * spacings[k] < size:
             clouds[k] = voxel_reduced(clouds[k], size)
             spacings[k] = spacing(clouds[k])
-    return *clouds, max(spacings)
+    return *clouds, max(*spacings, FINEST)
 
 
 def padded(
@@ -247,11 +248,10 @@ def nearest(
 def spacing(points: Float[np.ndarray, "n 3"]) -> float:
     """How far apart neighbouring points of the surface are: the median distance to the 4th nearest.
 
-    On a surface covered by squares of edge a, one point each, this is about a. At least 1e-6, the
-    resolution of float32 in a cloud of radius 1.
+    On a surface covered by squares of edge a, one point each, this is about a; 0 of a single point.
     """
     k = min(4, len(points) - 1)
     if k < 1:
-        return _FINEST
+        return 0.0
     distance = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, -1]
-    return max(float(np.median(distance)), _FINEST)
+    return float(np.median(distance))

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxreg.register import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
-_UNKNOWN = "not known without a refinement"
+_UNKNOWN = "not known: nothing was refined, or no surfaces are within reach"
 
 
 def verdict_line(result: ScanRegistration) -> str:
@@ -25,15 +25,15 @@ def figures(result: ScanRegistration) -> dict[str, str]:
     angle = math.degrees(axis_angle(result.rotation)[1])
     deviations = np.sqrt(np.maximum(np.diag(result.covariance), 0))
     turn, shift = math.degrees(deviations[:3].max()), deviations[3:].max()
-    refined = bool(deviations.any())
+    known = bool(np.isfinite(deviations).all())
     return {
         "rotation": f"{angle:.3f} deg",
         "translation": ", ".join(f"{x:.9g}" for x in result.translation),
         "overlap": f"{result.overlap:.2f}",
         "fitness": f"{result.fitness:.2f} within {result.reach:.4g}",
         "inlier rmse": f"{result.inlier_rmse:.4g}",
-        "one sigma": f"{turn:.2g} deg, {shift:.2g}" if refined else _UNKNOWN,
-        "weak directions": "\n".join(result.weak_directions) or ("none" if refined else _UNKNOWN),
+        "one sigma": f"{turn:.2g} deg, {shift:.2g}" if known else _UNKNOWN,
+        "weak directions": "\n".join(result.weak_directions) or ("none" if known else _UNKNOWN),
         "dropped points": str(result.dropped),
         "time": f"{result.seconds:.2f} s",
     }

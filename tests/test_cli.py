@@ -234,6 +234,27 @@ def test_files_that_cannot_be_written_are_named(folder, tmp_path, capsys):
     assert err == f"error: {tmp_path / 'r.json'} is a directory: name a file in it.\n"
 
 
+def test_las_without_laspy_is_told_before_the_work(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    monkeypatch.setattr("jaxreg.register.register", lambda *_, **__: pytest.fail("it registered"))
+    files = (folder / "a.ply", folder / "b.pcd")
+    status, out, err = run(capsys, "register", *files, "-o", tmp_path / "out.las")
+    assert (status, out) == (cli.BAD_INPUT, "")
+    assert "LAS and LAZ need laspy" in err
+
+
+def test_view_names_the_page_that_cannot_be_written(folder, tmp_path, capsys, monkeypatch):
+    def full(path, *_, **__):
+        path.write_text("half")
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("jaxreg.viewer.write_page", full)
+    status, out, err = run(capsys, "view", folder / "a.ply", "-o", tmp_path / "v.html")
+    told = "could not be written (No space left on device): choose another place."
+    assert (status, out, err) == (cli.BAD_INPUT, "", f"error: {tmp_path / 'v.html'} {told}\n")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     "arguments", [[], ["register", "a.ply"], ["fly"], ["info", "a.ply", "--x"]]
 )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg import verdict
 from jaxreg.config import RegisterConfig
 from jaxreg.data import shapes
 from jaxreg.refine import tree
@@ -154,8 +155,19 @@ def test_given_pose_skips_the_search(pair):
     found = register(source, reference, initial=RigidTransform(near, shift))
     assert angle_deg(found.rotation, truth.rotation) < 1
     kept = register(source, reference, initial=RigidTransform(near, shift), refine=None)
-    np.testing.assert_allclose(kept.rotation, near, atol=1e-6)
-    np.testing.assert_allclose(kept.translation, shift, atol=1e-5)
+    np.testing.assert_allclose(kept.rotation, near, atol=1e-14)
+    np.testing.assert_allclose(kept.translation, shift, atol=1e-14)
+    assert np.isnan(found.evidence.rival)
+    assert np.isfinite(found.covariance).all()
+    assert np.isnan(kept.covariance).all()  # zero would say that the pose is known for sure
+
+
+def test_a_pose_that_is_not_refined_stays_even_where_points_coincide():
+    turn = Rotation.from_rotvec(np.radians(30) * np.array([1, 2, 3]) / 14**0.5).as_matrix()
+    start = np.block([[turn, np.zeros((3, 1))], [0, 0, 0, 1]])  # about the middle of the grid
+    grid = np.stack(np.meshgrid(*[np.arange(-1.0, 2)] * 3), axis=-1).reshape(-1, 3)
+    kept = register(grid, grid, initial=start, refine=None)
+    np.testing.assert_allclose(kept.transformation, start, atol=1e-14)
 
 
 @pytest.mark.parametrize("method", ["icp", "point_to_plane", None])
@@ -167,6 +179,17 @@ def test_other_refinements(pair, method):
 def test_limited_rotation_is_kept(pair):
     found = register(*pair[:2], rotation="limited")
     assert np.degrees(Rotation.from_matrix(found.rotation).magnitude()) < 95
+    assert found.evidence.rival <= verdict.NO_RIVAL  # and no pose beyond counts as a rival
+
+
+def test_limited_rotation_is_kept_where_all_rotations_fit(seed):
+    """A vase looks alike from everywhere: of some two dozen distinct poses one is within bounds."""
+    rng = np.random.default_rng(seed)
+    angle, height = rng.uniform(0, 2 * np.pi, (2, 450)), rng.uniform(-0.8, 0.8, (2, 450))
+    radius = 0.4 + 0.15 * np.sin(4 * height)
+    vases = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+    found = register(*vases, rotation="limited", config=RegisterConfig(limited_deg=10))
+    assert np.degrees(Rotation.from_matrix(found.rotation).magnitude()) < 15
 
 
 def test_nonfinite_points_are_named_or_dropped(pair, result):
@@ -206,7 +229,7 @@ def test_awkward_clouds_give_a_finite_rotation(name):
         np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(found.rotation) > 0
         assert np.isfinite(found.confidence).all()
-        assert np.isfinite(found.covariance).all()
+        assert np.isfinite(found.covariance).all() or np.isnan(found.covariance).all()
 
 
 @pytest.mark.parametrize("name", ["line", "three points", "one place", "plane"])

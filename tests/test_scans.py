@@ -74,7 +74,8 @@ def test_reduction_with_a_stray_point(rng):
 def test_spacing_of_a_grid_is_its_edge():
     grid = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0]), axis=-1).reshape(-1, 3)
     assert scans.spacing(0.25 * grid) == pytest.approx(0.25)
-    assert scans.spacing(np.zeros((5, 3))) == pytest.approx(1e-6)
+    assert scans.spacing(1e-12 * grid) == pytest.approx(1e-12)  # in whatever unit
+    assert scans.at_one_density(*2 * [np.zeros((5, 3))], 9)[2] == pytest.approx(1e-6)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import jaxreg
 
 PICTURES, CHECKPOINTS, MESHES = {"matplotlib", "PIL"}, {"orbax", "tensorstore"}, {"trimesh"}
-TRAINING, FILES, BROWSER = {"optax", "h5py"}, {"plyfile", "laspy"}, {"plotly", "selenium"}
+TRAINING, FILES, BROWSER = {"optax", "h5py"}, {"plyfile", "laspy"}, {"selenium"}
 HEAVY = PICTURES | CHECKPOINTS | MESHES | TRAINING | FILES | BROWSER | {"open3d", "sklearn"}
 SCIPY = {"scipy.optimize", "scipy.stats", "scipy.interpolate", "scipy.signal"}
 

@@ -54,8 +54,10 @@ def test_figures_have_units(result):
 
 
 def test_nothing_is_claimed_without_a_refinement(result):
-    told = summary.figures(result._replace(covariance=np.zeros((6, 6)), weak_directions=()))
-    assert told["one sigma"] == told["weak directions"] == "not known without a refinement"
+    told = summary.figures(result._replace(covariance=np.full((6, 6), np.nan), weak_directions=()))
+    assert told["one sigma"] == told["weak directions"] == summary._UNKNOWN
+    exact = summary.figures(result._replace(covariance=np.zeros((6, 6)), weak_directions=()))
+    assert (exact["one sigma"], exact["weak directions"]) == ("0 deg, 0", "none")
 
 
 def test_record_is_json_and_reads_back(result):

@@ -67,7 +67,7 @@ def make_pair(
     `shape_mask` leaves fewer valid points than a cloud has rows: no crop prefers padding to a valid
     point, and the rows are then valid points of the shape, padding, outliers, in this order.
 
-    Crops (METHOD section 4). `viewpoint` keeps the points nearest to one far viewpoint, the *same*
+    Crops: `viewpoint` keeps the points nearest to one far viewpoint, the *same*
     for both clouds although the reference has moved already, so the clouds overlap in part.
     `half-space` keeps the points farthest along a random direction; a shared direction is fixed in
     the source's frame and turns with the reference, so the same physical part remains in both

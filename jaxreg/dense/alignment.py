@@ -13,7 +13,7 @@ from jaxreg import rigid, symmetric
 from jaxreg.dense.nearest import NearestGrid, lookup, nearest_packed
 from jaxreg.dense.surface import Surface
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import plane_covariances
+from jaxreg.refine.normals import surface_covariances
 from jaxreg.types import RigidTransform
 
 
@@ -60,8 +60,8 @@ def align_fine(
 
     Differentiable in the points and normals; which point is nearest is a constant.
     """
-    covariances = plane_covariances(source.normals, thickness)
-    others = plane_covariances(reference.normals, thickness)
+    covariances = surface_covariances(source.normals, thickness)
+    others = surface_covariances(reference.normals, thickness)
     rows, columns = (jnp.arange(len(s.mask), dtype=jnp.int32) for s in (source, reference))
     # Both masks count in both directions: with an empty cloud there is no pair at all.
     usable = jnp.any(source.mask) & jnp.any(reference.mask)

@@ -70,7 +70,7 @@ def learned_features(
     hidden = jax.nn.gelu(_layer(network, "lift", jnp.concatenate(inputs, axis=1)))
     graph = knn(points, min(_NEIGHBORS, len(points) - 1), mask)
     for name, chosen, radius in _ROUNDS:
-        neighbors = graph[:, chosen]
+        neighbors = graph[:, chosen] if graph.shape[1] > 3 else graph  # a cloud of four points
         edges = _edge_invariants(points, normals, neighbors, radius)
         there = _layer(network, f"{name}_there", hidden)[neighbors]
         here = _layer(network, f"{name}_here", hidden)[:, None]

@@ -1,7 +1,7 @@
 """Multi-scale moment descriptors: how the points, and their normals, lie around every point.
 
 Everything is a Gaussian-weighted mean over the whole cloud, so that one product of the weights
-(n, n) with a table (n, 26) gives every point's statistics: no neighbour lists, no histograms.
+(n, n) with a table (n, 21) gives every point's statistics: no neighbour lists, no histograms.
 """
 
 from typing import NamedTuple

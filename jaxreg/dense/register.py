@@ -97,7 +97,7 @@ def search_dense(
     """The poses of the search before the last refinement; arguments and errors as `register_dense`.
 
     `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
-    (radians) are not.
+    (radians) come last, with a score 10 lower.
     """
     where, x, y = enter(source, reference, source_mask, reference_mask, config)
     also = None if also is None else frame.transform_in(where, also)
@@ -184,7 +184,8 @@ def _search(
         pose, few, fewer, config.fine_widths, thickness=config.thickness
     )
     widening = _widening(x, y, source_mask, reference_mask, config)
-    poses = _shortlist(jax.vmap(coarse)(poses), source, reference, grids, widening, config)
+    poses = jax.vmap(coarse)(poses)
+    poses = _shortlist(poses, source, reference, grids, widening, largest_angle, config)
     poses = jax.lax.map(fine, poses)
     return _ranked(poses, source, reference, widening, largest_angle, config)
 
@@ -228,7 +229,7 @@ def _screened(
     backward = jax.vmap(rigid.inverse)(poses)
     score = screen(poses, a, reference, grids[0], width=config.screen_width)
     score = score + screen(backward, b, source, grids[1], width=config.screen_width)
-    score = jnp.where(_turns_less(poses, largest_angle), score, -5)
+    score = _bounded(score, poses, largest_angle)
     if also is not None:
         score = score.at[0].set(5)
     return _distinct_best(
@@ -241,9 +242,14 @@ def _distinct_best(poses, score: Array, most: int, angle: float, distance: float
     return best_of(poses, pick_distinct(poses, score, count=count, angle=angle, distance=distance))
 
 
+def _bounded(score: Array, poses: RigidTransform, largest_angle) -> Float[Array, "s"]:
+    """The scores (within a few units of 0), those of poses that turn too far below all others."""
+    return jnp.where(_turns_less(poses, largest_angle), score, score - 10)
+
+
 def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:
     trace = jnp.sum(jnp.diagonal(poses.rotation, axis1=1, axis2=2), axis=1)
-    return trace >= 1 + 2 * jnp.cos(angle) - 1e-5
+    return trace >= 1 + 2 * jnp.cos(jnp.minimum(angle, math.pi)) - 1e-5
 
 
 def _shortlist(
@@ -252,6 +258,7 @@ def _shortlist(
     reference: Surface,
     grids: list[NearestGrid],
     widening: Array,
+    largest_angle,
     config: DenseConfig,
 ) -> RigidTransform:
     """The distinct poses that are plausible at a glance: the last alignment is what takes time."""
@@ -270,7 +277,7 @@ def _shortlist(
     )(poses)
     return _distinct_best(
         poses,
-        _score(found, config),
+        _bounded(_score(found, config), poses, largest_angle),
         config.aligned,
         config.aligned_angle,
         config.aligned_distance,
@@ -297,9 +304,8 @@ def _ranked(
         ),
         poses,
     )
-    score = _score(found, config)
-    # Alignment may have turned a pose out of the bounds of the search.
-    score = jnp.where(_turns_less(poses, largest_angle), score, score - 10)
+    # Again, since alignment may have turned a pose out of the bounds of the search.
+    score = _bounded(_score(found, config), poses, largest_angle)
     score, order = jax.lax.top_k(score, len(score))
     return Search(best_of(poses, order), score)
 

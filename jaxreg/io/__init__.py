@@ -68,7 +68,7 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
 
 
 def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
-    """Write points in the format of the suffix; float64 wherever the format allows it.
+    """Write points in the format of the suffix: float64, in text 12 digits, in LAS integer steps.
 
     LAS and LAZ leave out rows that are not finite; all other formats keep them.
 
@@ -81,12 +81,14 @@ def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raises ValueError unless `write_cloud` could write there."""
+    """Raises ValueError unless `write_cloud` could write there: suffix, folder, and laspy for LAS."""
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(
             f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
             f"{', '.join(WRITABLE)}."
         )
+    if path.suffix.lower() in (".las", ".laz"):
+        las.check_installed(path)
     check_folder(path)
 
 

@@ -46,7 +46,8 @@ def _points(array: np.ndarray, where: str) -> np.ndarray:
 
 def write(path: Path, points: np.ndarray) -> None:
     """The array itself, or an archive with the array `points`."""
-    if path.suffix.lower() == ".npz":
-        np.savez_compressed(path, points=points)
-    else:
-        np.save(path, points)
+    with path.open("wb") as file:  # To a name, numpy would append its own suffix to ".NPY".
+        if path.suffix.lower() == ".npz":
+            np.savez_compressed(file, points=points)
+        else:
+            np.save(file, points)

@@ -58,6 +58,11 @@ def _store(cloud, points: np.ndarray, path: Path) -> None:
     cloud.write(str(path))
 
 
+def check_installed(path: Path) -> None:
+    """Raises ValueError where the file `path` could not be read or written for want of laspy."""
+    _laspy(path)
+
+
 def _laspy(path: Path):
     try:
         import laspy

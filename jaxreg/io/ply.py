@@ -53,11 +53,11 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
     elements = []
     for element in data.elements:
         if element.name == "vertex":
-            element = PlyElement.describe(_moved(element.data, rotation, translation), "vertex")
+            moved = _moved(element.data, rotation, translation)
+            element = PlyElement.describe(moved, "vertex", comments=element.comments)
         elements.append(element)
-    PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments).write(
-        str(path)
-    )
+    header = {"comments": data.comments, "obj_info": data.obj_info}
+    PlyData(elements, text=data.text, byte_order=data.byte_order, **header).write(str(path))
 
 
 def _moved(vertex: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -83,18 +83,25 @@ def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple
     """Where x, y, z stand among `width` columns, by the lines above the points, last line first.
 
     Raises:
-      ValueError: a header names columns, but not x, y, z; or it is a line of one or two words.
+      ValueError: a header names columns, but not x, y, z, or more than there are; or it is a line of
+        one or two words.
     """
     for _, line in reversed(head):
         for names in _namings(line, separator):
             axes = [_axis(name) for name in names]
-            if set("xyz") <= set(axes) and (_is_data(line) or len(names) == width):
+            wide = len(names) <= width if _is_data(line) else len(names) == width
+            if set("xyz") <= set(axes) and wide:
                 return tuple(axes.index(axis) for axis in "xyz")
     for number, line in head:
         names = _split(_joined(line, separator), separator)
         if _is_data(line) and len(names) < 3:
             raise ValueError(
                 f"{path}, line {number}: '{' '.join(names)}' is no point: give x y z in a line."
+            )
+        if _is_data(line) and len(names) > width and set("xyz") <= set(map(_axis, names)):
+            raise ValueError(
+                f"{path}, line {number}: the header has {len(names)} names for {width} columns: part "
+                "them by what parts the columns, with no blank inside a name."
             )
         # A comment is a header only on the first line, and not if it is a remark like "by: me".
         titled = number == head[0][0] and all(_is_name(name) for name in names)
@@ -108,10 +115,14 @@ def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple
 
 
 def _namings(line: str, separator: str | None) -> list[list[str]]:
-    """The names in a line: split as the points are, else as the line itself suggests."""
+    """The names in a line: split as the points are, or as the line itself suggests.
+
+    By tabs first, since blanks may then stand inside a name ("Point ID").
+    """
     text = _LABEL.sub("", _joined(line, separator))
     own = _separator(text)
-    return [_split(text, separator), _split(_joined(text, own), own)]
+    by_tabs = [_split(text, "\t")] if "\t" in text and not separator else []
+    return [*by_tabs, _split(text, separator), _split(_joined(text, own), own)]
 
 
 def _joined(line: str, separator: str | None) -> str:

@@ -10,7 +10,7 @@ from jaxreg.config import RefineConfig
 from jaxreg.neighbors import knn
 from jaxreg.refine import frame
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import normals, plane_covariances, surface_covariances
+from jaxreg.refine.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.pairing import (
     Kernel,
     Pairs,
@@ -45,15 +45,16 @@ def gicp(
     neighbors: int = _DEFAULT.neighbors,
     thickness: float = _DEFAULT.thickness,
     partners: int = 1,
-    edges: bool = False,
+    edges: bool = _DEFAULT.edges,
 ) -> RigidTransform:
     """The pose after a fixed number of Gauss-Newton steps on ``sum_i w_i r_i^T M_i r_i``.
 
     ``r_i = R x_i + t - y_i`` with ``y_i`` nearest to the moved ``x_i``, and
-    ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is the smallest
-    variance of the covariances: a residual across two parallel surfaces then counts as its length.
+    ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is `thickness`: of
+    covariances that are as small across a surface, a residual across two parallel ones then counts
+    as its length.
     Covariances that are not given are those of planes: 1 along, `thickness` across, from
-    `neighbors` neighbours; with `edges`, of surfaces that end (`normals.surface_covariances`).
+    `neighbors` neighbours; with `edges`, of surfaces that end (`normals.edge_normals`).
     `kernel` weighs ``sqrt(r^T M r)``. With more than one of `partners`, a
     point is also paired with the nearest neighbours of its partner, which averages the noise of
     their planes. Everything else is as for `jaxreg.refine.icp.icp`.
@@ -75,10 +76,10 @@ def gicp(
         if covariances is not None and partners == 1:
             return None, covariances
         graph = knn(cloud, neighbors, mask)
-        if covariances is None and edges:
-            covariances = surface_covariances(cloud, graph, mask, thickness=thickness)
-        elif covariances is None:
-            covariances = plane_covariances(normals(cloud, graph, mask), thickness)
+        if covariances is None:
+            across = normals(cloud, graph, mask)
+            ends = edge_normals(cloud, graph, across, mask) if edges else None
+            covariances = surface_covariances(across, thickness, ends)
         return graph[:, : partners - 1], covariances
 
     near_source, source_covariances = described(x, source_mask, source_covariances)

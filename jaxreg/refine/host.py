@@ -1,12 +1,13 @@
-"""Refinement from the host: numpy in and out, 3 to a million points, any offset and unit."""
+"""Refinement from the host: numpy in and out, up to a million points, any offset and unit."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg import scans
 from jaxreg.config import RefineConfig
 from jaxreg.refine.frame import Frame
 from jaxreg.refine.gicp import gicp
@@ -48,6 +49,7 @@ def refine(
     both_directions: bool = _DEFAULT.both_directions,
     neighbors: int = _DEFAULT.neighbors,
     thickness: float = _DEFAULT.thickness,
+    edges: bool = _DEFAULT.edges,
     tolerance: float = _DEFAULT.tolerance,
     dense_limit: int = _DEFAULT.dense_limit,
 ) -> Refined:
@@ -56,13 +58,16 @@ def refine(
     Centred and scaled in float64, solved in JAX's default precision, composed in float64. Options
     are those of `icp`, `point_to_plane` and `gicp`; clouds of at most `dense_limit` points are
     solved by these functions, larger ones by a k-d tree, which stops when a step turns by less than
-    `tolerance` radians and moves by less than as many radii of the cloud.
+    `tolerance` radians and moves by less than as many radii of the cloud. Above 30,000 points every
+    k-th one comes first, and then all of them for up to `iterations` more.
 
     Raises:
       ValueError: a cloud is not (n, 3), not numeric, holds NaN or infinity, or has not more than
         `neighbors` points; or an option is wrong.
     """
     check_options(iterations=iterations, trim=trim, anneal=anneal)
+    if method not in get_args(Method):
+        raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {method!r}.")
     source = _checked("source", source, neighbors)
     reference = _checked("reference", reference, neighbors)
     where, x, y = _enter(source, reference)
@@ -72,7 +77,7 @@ def refine(
         pose, uncertainty = _dense(
             *_padded(x), *_padded(y), start, weighting.scale, weighting.max_distance,
             method=method, kernel=kernel, trim=trim, iterations=iterations, anneal=anneal,
-            both_directions=both_directions, neighbors=neighbors, thickness=thickness,
+            both_directions=both_directions, neighbors=neighbors, thickness=thickness, edges=edges,
         )  # fmt: skip
         return Refined(_pose_out(where, pose), iterations, None, _in_units(uncertainty, where))
     source_cloud = index_cloud(x, neighbors=neighbors)
@@ -80,9 +85,13 @@ def refine(
     pose, taken, converged, pairs = iterate(
         start, source_cloud, reference_cloud, weighting,
         widenings(iterations, anneal, np.dtype("float32")),
-        method=method, thickness=thickness, both_directions=both_directions, tolerance=tolerance,
+        method=method, thickness=thickness, edges=edges, both_directions=both_directions,
+        tolerance=tolerance,
     )  # fmt: skip
     moved, _ = _padded(x @ pose.rotation.T + pose.translation)
+    # One pair for every point of the source, as `pose_uncertainty` has them: the way back sees the
+    # same distances again.
+    pairs = pairs._replace(mask=pairs.mask & (np.arange(len(pairs.mask)) < len(x)))
     uncertainty = _uncertainty(
         moved, reference_cloud.padded, reference_cloud.normals, pairs,
         weighting.scale, weighting.max_distance, kernel=kernel, trim=trim,
@@ -93,10 +102,10 @@ def refine(
 _STATIC = ("method", "kernel", "trim", "iterations", "anneal", "both_directions", "neighbors")
 
 
-@partial(jax.jit, static_argnames=(*_STATIC, "thickness"))
+@partial(jax.jit, static_argnames=(*_STATIC, "thickness", "edges"))
 def _dense(
     x, x_mask, y, y_mask, start, scale, max_distance, *,
-    method, kernel, trim, iterations, anneal, both_directions, neighbors, thickness,
+    method, kernel, trim, iterations, anneal, both_directions, neighbors, thickness, edges,
 ):  # fmt: skip
     masks = {"source_mask": x_mask, "reference_mask": y_mask}
     weights = {"scale": scale, "max_distance": max_distance, "kernel": kernel, "trim": trim}
@@ -107,7 +116,7 @@ def _dense(
     elif method == "point_to_plane":
         pose = point_to_plane(x, y, neighbors=neighbors, **options)
     else:
-        pose = gicp(x, y, neighbors=neighbors, thickness=thickness, **options)
+        pose = gicp(x, y, neighbors=neighbors, thickness=thickness, edges=edges, **options)
     return pose, pose_uncertainty(pose, x, y, neighbors=neighbors, **masks, **weights)
 
 
@@ -139,28 +148,24 @@ def _checked(name: str, points: np.ndarray, neighbors: int) -> np.ndarray:
     return points
 
 
-def _enter(source: np.ndarray, reference: np.ndarray) -> tuple[Frame, np.ndarray, np.ndarray]:
+def _enter(source: np.ndarray, reference: np.ndarray):
     """`jaxreg.refine.frame.enter` in float64, which the device may not have."""
     centres = source.mean(axis=0), reference.mean(axis=0)
     x, y = source - centres[0], reference - centres[1]
     length = np.sqrt(((x**2).sum(axis=1).mean() + (y**2).sum(axis=1).mean()) / 2)
     length = length if length > 0 else np.float64(1)
-    return Frame(*centres, length), x / length, y / length
+    return scans.Frame(*centres, length), x / length, y / length
 
 
-def _pose_in(where: Frame, pose: RigidTransform | None) -> RigidTransform:
+def _pose_in(where: scans.Frame, pose: RigidTransform | None) -> RigidTransform:
     pose = RigidTransform(np.eye(3), np.zeros(3)) if pose is None else pose
-    rotation, translation = (np.asarray(leaf, np.float64) for leaf in pose)
-    shift = translation + rotation @ where.source_centre - where.reference_centre
-    return RigidTransform(rotation, shift / where.length)
+    return scans.pose_in(where, RigidTransform(*(np.asarray(leaf, np.float64) for leaf in pose)))
 
 
-def _pose_out(where: Frame, pose: RigidTransform) -> RigidTransform:
+def _pose_out(where: scans.Frame, pose: RigidTransform) -> RigidTransform:
     rotation, translation = (np.asarray(leaf, np.float64) for leaf in pose)
-    u, _, vt = np.linalg.svd(rotation)  # orthogonal to float32 only, until here
-    rotation = u @ vt
-    shift = translation * where.length + where.reference_centre
-    return RigidTransform(rotation, shift - rotation @ where.source_centre)
+    # It is orthogonal to float32 only, until here.
+    return scans.pose_out(where, RigidTransform(scans.nearest_rotation(rotation), translation))
 
 
 def _padded(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +174,7 @@ def _padded(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(points, ((0, size - len(points)), (0, 0))), mask
 
 
-def _in_units(uncertainty: PoseUncertainty, where: Frame) -> PoseUncertainty:
+def _in_units(uncertainty: PoseUncertainty, where: scans.Frame) -> PoseUncertainty:
     """The uncertainty in the frame as one in the unit of the clouds, in float64."""
     values = PoseUncertainty(*(np.asarray(leaf, np.float64) for leaf in uncertainty))
     units = np.repeat([1.0, where.length], 3)

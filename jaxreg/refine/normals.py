@@ -25,14 +25,14 @@ def neighborhood_covariances(
     `neighbors` are rows of `points`, as `jaxreg.knn` gives them; a point that fills its own list
     counts once. Padded rows give zero.
     """
-    edges, weight = _edges(points, neighbors, mask)
+    offsets, weight = _offsets(points, neighbors, mask)
     total = jnp.maximum(jnp.sum(weight, axis=1), 1)
-    centred = (edges - (jnp.sum(weight * edges, axis=1) / total)[:, None, :]) * weight
+    centred = (offsets - (jnp.sum(weight * offsets, axis=1) / total)[:, None, :]) * weight
     product = jnp.matmul(centred.mT, centred, precision=Precision.HIGHEST)
     return product / total[..., None]
 
 
-def _edges(points, neighbors, mask) -> tuple[Array, Array]:
+def _offsets(points, neighbors, mask) -> tuple[Array, Array]:
     """From every point to itself and its neighbours (n, k + 1, 3); 1 where one counts, else 0."""
     points = without_padding(points, mask)
     own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
@@ -40,8 +40,8 @@ def _edges(points, neighbors, mask) -> tuple[Array, Array]:
     if mask is not None:
         counts = counts & mask[:, None]
     # Relative to the point itself: the mean of near points loses no digits to a far origin.
-    edges = points[jnp.concatenate([own, neighbors], axis=1)] - points[:, None, :]
-    return edges, counts.astype(points.dtype)[..., None]
+    offsets = points[jnp.concatenate([own, neighbors], axis=1)] - points[:, None, :]
+    return offsets, counts.astype(points.dtype)[..., None]
 
 
 def normals(
@@ -58,42 +58,47 @@ def normals(
     return smallest_eigenvector(neighborhood_covariances(points, neighbors, mask))
 
 
-def plane_covariances(unit_normals: Float[Array, "n 3"], thickness: float) -> Float[Array, "n 3 3"]:
+def edge_normals(
+    points: Float[Array, "n 3"],
+    neighbors: Int[Array, "n k"],
+    unit_normals: Float[Array, "n 3"],
+    mask: Bool[Array, "n"] | None = None,
+) -> Float[Array, "n 3"]:
+    """Along the surface and across its edge, inwards: length 1 on an edge, 0 away from all edges.
+
+    On the edge of a plate the neighbours lie on one side; `unit_normals` are those of `normals`.
+    """
+    offsets, weight = _offsets(points, neighbors, mask)
+    offsets = offsets * weight
+    across = jnp.sum(offsets * unit_normals[:, None, :], axis=-1, keepdims=True)
+    along = offsets - across * unit_normals[:, None, :]
+    inward = jnp.sum(along, axis=1)
+    length, total = safe_norm(inward), jnp.sum(safe_norm(along), axis=1)
+    openness = length / jnp.where(total > 0, total, 1)
+    # The root of a share, since covariances take the square.
+    share = jnp.exp(0.5 * jax.nn.log_sigmoid((openness - _OPEN) / _OPEN_WIDTH))
+    return inward * (share / jnp.where(length > 0, length, 1))[:, None]
+
+
+def surface_covariances(
+    unit_normals: Float[Array, "n 3"],
+    thickness: float,
+    edges: Float[Array, "n 3"] | None = None,
+) -> Float[Array, "n 3 3"]:
     """``I - (1 - thickness) n n^T``: variance 1 along the plane, `thickness` across it.
 
     The regularisation of generalised ICP (Segal, Haehnel and Thrun, 2009, section III.B). A zero
     normal gives the identity: nothing is known about the surface there.
+
+    With `edges` (`edge_normals`) the surface also ends: ``- (1 - thickness) e e^T``. On an edge the
+    distance across it says where the point is, and of two plates nothing else says how far one has
+    slid along the other. An edge is met by an edge only: a point whose partner lies inside a surface
+    is as free as before.
     """
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
+    if edges is not None:
+        outer = outer + edges[:, :, None] * edges[:, None, :]
     return jnp.eye(3, dtype=outer.dtype)[None] - (1 - thickness) * outer
-
-
-def surface_covariances(
-    points: Float[Array, "n 3"],
-    neighbors: Int[Array, "n k"],
-    mask: Bool[Array, "n"] | None = None,
-    *,
-    thickness: float,
-) -> Float[Array, "n 3 3"]:
-    """`plane_covariances` that end where the surface does: `thickness` across its edge, too.
-
-    On the edge of a plate the neighbours lie on one side. There the distance to the edge says where
-    the point is, and of two plates nothing else says how far one has slid along the other. An edge
-    is met by an edge only: a point whose partner lies inside a surface is as free as before.
-    """
-    unit_normals = normals(points, neighbors, mask)
-    edges, weight = _edges(points, neighbors, mask)
-    edges = edges * weight
-    across = jnp.sum(edges * unit_normals[:, None, :], axis=-1, keepdims=True)
-    along = edges - across * unit_normals[:, None, :]
-    inward = jnp.sum(along, axis=1)
-    length, total = safe_norm(inward), jnp.sum(safe_norm(along), axis=1)
-    openness = length / jnp.where(total > 0, total, 1)
-    share = jax.nn.sigmoid((openness - _OPEN) / _OPEN_WIDTH)
-    inward = inward / jnp.where(length > 0, length, 1)[:, None]
-    outer = inward[:, :, None] * inward[:, None, :]
-    planes = plane_covariances(unit_normals, thickness)
-    return planes - ((1 - thickness) * share)[:, None, None] * outer
 
 
 def smallest_eigenvector(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:

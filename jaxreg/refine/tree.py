@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from jaxreg.refine.gicp import gicp_step
 from jaxreg.refine.icp import point_to_point_step
-from jaxreg.refine.normals import normals, plane_covariances
+from jaxreg.refine.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.pairing import Pairs, Weighting
 from jaxreg.refine.point_to_plane import point_to_plane_step
 from jaxreg.types import RigidTransform
@@ -28,16 +28,17 @@ _SMALLEST = 256
 
 
 class IndexedCloud(NamedTuple):
-    """A cloud on the host with its tree, and on the device, padded, with its normals."""
+    """A cloud on the host with its tree, and on the device, padded, with its normals and edges."""
 
     points: np.ndarray
     tree: cKDTree
     padded: Float[Array, "n 3"]
     normals: Float[Array, "n 3"]
+    edge_normals: Float[Array, "n 3"]
 
 
 def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
-    """Tree and normals of a cloud (n, 3)."""
+    """Tree, normals and edges of a cloud (n, 3)."""
     tree = cKDTree(points)
     # One more than asked for: the point finds itself, and a row of its own index does not count.
     _, index = tree.query(points, k=neighbors + 1, workers=-1)
@@ -45,7 +46,7 @@ def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
     rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
     rows[: len(points)] = index
     padded = jax.device_put(np.pad(points, ((0, size - len(points)), (0, 0))))
-    return IndexedCloud(points, tree, padded, _normals(padded, rows))
+    return IndexedCloud(points, tree, padded, *_normals(padded, rows))
 
 
 def iterate(
@@ -57,32 +58,35 @@ def iterate(
     *,
     method: Method,
     thickness: float,
+    edges: bool,
     both_directions: bool,
     tolerance: float,
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    `widths` are the widenings of the kernel. Where a step is below `tolerance` half of the
-    remaining ones are skipped. Large clouds first converge with every k-th point.
+    `widths` are the widenings of the kernel, 1 the last. Where a step is below `tolerance` half of
+    the remaining ones are skipped, and at width 1 all are. Large clouds first converge with every
+    k-th point.
     """
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
         i, converged = 0, False
-        while i < len(widths) and not (converged and widths[i] == 1):
+        while i < len(widths) and not converged:
             pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
             new = _step(
                 pose, source[2:], reference[2:], pairs,
                 weighting.scale, weighting.max_distance, float(widths[i]),
                 kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
+                edges=edges,
             )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
-            converged = _change(pose, new) < tolerance
-            pose, taken = new, taken + 1
-            # At least to the next width; at the last width a converged loop ends.
+            still = _change(pose, new) < tolerance
+            pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
+            # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + len(widths)) // 2, len(widths) - 1)
-            i = max(i + 1, halfway) if converged and widths[i] != 1 else i + 1
+            i = max(i + 1, halfway) if still else i + 1
     return pose, taken, converged, pairs
 
 
@@ -119,21 +123,31 @@ def padded_size(count: int) -> int:
     return max(-(-count // unit) * unit, _SMALLEST)
 
 
-_normals = jax.jit(normals)
+@jax.jit
+def _normals(points, neighbors):
+    across = normals(points, neighbors)
+    return across, edge_normals(points, neighbors, across)
 
 
-@partial(jax.jit, static_argnames=("kernel", "trim", "method", "thickness"))
+_STATIC = ("kernel", "trim", "method", "thickness", "edges")
+
+
+@partial(jax.jit, static_argnames=_STATIC)
 def _step(
-    pose, source, reference, pairs, scale, max_distance, width, *, kernel, trim, method, thickness
-):
-    (x, source_normals), (y, reference_normals) = source, reference
+    pose, source, reference, pairs, scale, max_distance, width, *,
+    kernel, trim, method, thickness, edges,
+):  # fmt: skip
+    (x, *source_surface), (y, *reference_surface) = source, reference
     weighting = Weighting(kernel, scale, max_distance, trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
     if method == "icp":
         return point_to_point_step(pose, x, y, pairs, weighting, width)
     if method == "point_to_plane":
-        return point_to_plane_step(pose, x, y, reference_normals, pairs, weighting, width)
-    covariances = [plane_covariances(n, thickness) for n in (source_normals, reference_normals)]
+        return point_to_plane_step(pose, x, y, reference_surface[0], pairs, weighting, width)
+    covariances = [
+        surface_covariances(across, thickness, ends if edges else None)
+        for across, ends in (source_surface, reference_surface)
+    ]
     return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=thickness)
 
 

@@ -100,6 +100,22 @@ def pose_uncertainty(
     return uncertainty_of_pairs(where, moved, y, reference_normals, pairs, weighting)
 
 
+def about(uncertainty: PoseUncertainty, centre: Float[np.ndarray, "3"]) -> PoseUncertainty:
+    """The same uncertainty, its motions about another `centre` (unit of the clouds); numpy.
+
+    A rotation ``omega`` about the old centre moves the new one by ``omega x (new - old)``.
+    """
+    offset = np.asarray(centre, np.float64) - np.asarray(uncertainty.centre, np.float64)
+    change, back = np.eye(6), np.eye(6)
+    change[3:, :3] = np.cross(np.eye(3), offset).T
+    back[3:, :3] = -change[3:, :3]
+    return uncertainty._replace(
+        information=back.T @ np.asarray(uncertainty.information, np.float64) @ back,
+        covariance=change @ np.asarray(uncertainty.covariance, np.float64) @ change.T,
+        centre=np.asarray(centre, np.float64),
+    )
+
+
 def uncertainty_of_pairs(
     where: frame.Frame,
     moved: Float[Array, "n 3"],

@@ -52,7 +52,7 @@ def overlap(pair):
 
 
 def predecessor_overlap(shape, rng):
-    """The predecessor's generator in numpy loops, up to the order of the points (METHOD 4)."""
+    """The predecessor's generator in numpy loops, up to the order of the points."""
     angle = rng.uniform(0, np.pi / 4, 3)
     rotation = Rotation.from_euler("zyx", angle[::-1]).as_matrix()
     moved = shape @ rotation.T + rng.uniform(-0.5, 0.5, 3)

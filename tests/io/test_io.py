@@ -27,7 +27,7 @@ def points(seed):
     return np.random.default_rng(seed).normal(size=(40, 3)) * 3 + [5e6, -2e5, 100]
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz"])
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".NPY", ".NPZ"])
 def test_lossless_formats_keep_every_bit(tmp_path, points, suffix):
     io.write_cloud(tmp_path / f"cloud{suffix}", points)
     np.testing.assert_array_equal(io.read_cloud(tmp_path / f"cloud{suffix}"), points)
@@ -109,7 +109,8 @@ def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
     kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4")]
     rows = np.zeros(3, [*kinds, ("red", "u1")])
     rows["x"], rows["nx"], rows["red"] = [1, 2, 3], 1, [7, 8, 9]
-    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
+    vertex = PlyElement.describe(rows, "vertex", comments=["in metres"])
+    PlyData([vertex], obj_info=["num_cols 512"]).write(str(tmp_path / "a.ply"))
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     io.ply.write_moved(
         tmp_path / "b.ply", tmp_path / "a.ply", quarter, np.array([5e6 + 0.125, 0, 0])
@@ -119,6 +120,8 @@ def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
     np.testing.assert_array_equal(vertex["y"], [1, 2, 3])
     np.testing.assert_array_equal(vertex["ny"], [1, 1, 1])
     np.testing.assert_array_equal(vertex["red"], [7, 8, 9])
+    assert vertex.comments == ["in metres"]
+    assert PlyData.read(str(tmp_path / "b.ply")).obj_info == ["num_cols 512"]
 
 
 @pytest.mark.parametrize(
@@ -150,6 +153,9 @@ def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
         "# 9 9 9\n1 2 3\n4 5 6\n",
         "# --- --- ---\n1 2 3\n4 5 6\n",
         "1 2 3 # first of all\n4 5 6 # x y z\n",
+        "Point ID\tX\tY\tZ\tIntensity\n7\t1\t2\t3\t50\n8\t4\t5\t6\t50\n",
+        "# Point ID\tX\tY\tZ\n7\t1\t2\t3\n8\t4\t5\t6\n",
+        "a scan of last Monday\n1 2 3\n4 5 6\n",
     ],
 )
 def test_text_as_programs_write_it(tmp_path, content):

@@ -49,6 +49,10 @@ CASES = {
     "names.txt": (b"# id,a,b,c\n7,1,2,3\n8,4,5,6\n", "id, a, b, c.*name the columns x, y, z"),
     "slashes.txt": (b"\n//R G B\n1 2 3\n4 5 6\n", "line 2: .* R, G, B"),
     "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"remove the header"),
+    "blank-in-name.txt": (
+        b"Point ID X Y Z Intensity\n1 2 3 4 5\n6 7 8 9 10\n",
+        "line 1: the header has 6 names for 5 columns",
+    ),
     "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", "remove the header"),
     "binary.txt": (b"\xff\xfe\x00\x81" * 10, "no text"),
     "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),

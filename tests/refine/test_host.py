@@ -45,6 +45,36 @@ def test_tree_equals_brute_force(method, seed):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12)
 
 
+def test_covariance_is_that_of_one_direction_above_the_limit_too(seed):
+    source, reference, _ = make_pair(seed)
+    options = {"kernel": "none", "iterations": 80, "tolerance": 1e-12, "both_directions": True}
+    small = refine(source, reference, **options).uncertainty
+    large = refine(source, reference, dense_limit=0, **options).uncertainty
+    np.testing.assert_allclose(large.covariance, small.covariance, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.untyped
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match="icp, point_to_plane, gicp, got 'plane'"):
+        refine(*make_pair(0)[:2], method="plane")
+
+
+@pytest.mark.parametrize("dense_limit", [0, 1000])
+def test_edges_stop_a_plate_from_sliding(dense_limit):
+    """As `test_gicp.py` has it, through the host, by trees and by brute force."""
+    x, y = np.random.default_rng(0).uniform(0, 1, (2, 700, 3)) * [1, 1, 0]
+    offset = np.array([0.03, -0.02, 0.0])
+    options = {"max_distance": 0.06, "thickness": 0.01, "neighbors": 16, "both_directions": True}
+
+    def slide(edges):
+        options["edges"] = edges
+        pose = refine(x + offset, y, dense_limit=dense_limit, **options).transform
+        centre = x.mean(axis=0)
+        return np.linalg.norm(pose.rotation @ (centre + offset) + pose.translation - centre)
+
+    assert slide(edges=True) < 0.5 * slide(edges=False)
+
+
 def test_brute_force_is_the_pure_function(seed):
     source, reference, _ = make_pair(seed)
     expected = gicp(jnp.asarray(source), jnp.asarray(reference))

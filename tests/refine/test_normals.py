@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxreg.refine.normals import (
-    plane_covariances,
-    smallest_eigenvector,
-)
-from tests.compiled import knn, neighborhood_covariances, normals, surface_covariances
+from jaxreg.refine.normals import smallest_eigenvector, surface_covariances
+from tests.compiled import edge_normals, knn, neighborhood_covariances, normals
 
 
 def surface(seed, n=60):
@@ -39,13 +36,13 @@ def test_normals_equal_the_loop(seed, dtype, factor):
         assert abs(expected @ result[i]) > 1 - (1e-4 if dtype == "float32" else 1e-10)
 
 
-def test_plane_covariances_have_the_given_thickness(seed):
+def test_surface_covariances_have_the_given_thickness(seed):
     normal = np.random.default_rng(seed).normal(size=3)
     normal /= np.linalg.norm(normal)
-    (result,) = plane_covariances(jnp.asarray(normal)[None], 1e-3)
+    (result,) = surface_covariances(jnp.asarray(normal)[None], 1e-3)
     np.testing.assert_allclose(result @ normal, 1e-3 * normal, atol=1e-15)
     np.testing.assert_allclose(np.linalg.eigvalsh(result), [1e-3, 1, 1])
-    np.testing.assert_array_equal(plane_covariances(jnp.zeros((1, 3)), 1e-3)[0], np.eye(3))
+    np.testing.assert_array_equal(surface_covariances(jnp.zeros((1, 3)), 1e-3)[0], np.eye(3))
 
 
 def plate(side=13):
@@ -58,12 +55,19 @@ def plate(side=13):
 
 
 def test_a_surface_ends_at_its_edge(seed):
-    """Inside, the covariance is that of a plane; on an edge it is thin across the edge as well."""
+    """Inside, the covariance is that of a plane; on an edge it is thin across the edge as well.
+
+    The normal of the edge points into the surface.
+    """
     points, inside, middle = plate()
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    neighbors = knn(jnp.asarray(points @ turn.T), 24)
-    result = surface_covariances(jnp.asarray(points @ turn.T), neighbors, thickness=0.01)
-    result = turn.T @ result @ turn
+    cloud = jnp.asarray(points @ turn.T)
+    neighbors = knn(cloud, 24)
+    across = normals(cloud, neighbors)
+    edges = edge_normals(cloud, neighbors, across)
+    inward = (edges @ turn)[middle][:, 0]
+    np.testing.assert_allclose(inward, np.where(points[middle][:, 0] == 0, 1, -1), atol=0.1)
+    result = turn.T @ surface_covariances(across, 0.01, edges) @ turn
     expected = np.broadcast_to(np.diag([1, 1, 0.01]), result[inside].shape)
     np.testing.assert_allclose(result[inside], expected, atol=1e-4)
     expected = np.broadcast_to(np.diag([0.01, 1, 0.01]), result[middle].shape)
@@ -75,9 +79,12 @@ def test_padding_changes_no_surface():
     padded = np.concatenate([points, np.full((3, 3), np.nan)])
     mask = np.arange(len(padded)) < len(points)
     neighbors = knn(jnp.asarray(padded), 8, jnp.asarray(mask))
-    result = surface_covariances(jnp.asarray(padded), neighbors, jnp.asarray(mask), thickness=0.01)
-    alone = surface_covariances(jnp.asarray(points), knn(jnp.asarray(points), 8), thickness=0.01)
+    across = normals(jnp.asarray(padded), neighbors, jnp.asarray(mask))
+    result = edge_normals(jnp.asarray(padded), neighbors, across, jnp.asarray(mask))
+    points, neighbors = jnp.asarray(points), knn(jnp.asarray(points), 8)
+    alone = edge_normals(points, neighbors, normals(points, neighbors))
     np.testing.assert_allclose(result[: len(points)], alone, atol=1e-12)
+    assert np.linalg.norm(alone, axis=1).max() > 0.5
     assert np.isfinite(result).all()
 
 

@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg import rigid
-from jaxreg.refine.pairing import closest_pairs
-from jaxreg.refine.tree import index_cloud, padded_size, tree_pairs
+from jaxreg.refine.pairing import Weighting, closest_pairs
+from jaxreg.refine.tree import index_cloud, iterate, padded_size, tree_pairs
 from jaxreg.types import RigidTransform
 
 
@@ -17,6 +17,18 @@ def test_few_sizes_cover_all_counts():
     assert (sizes >= counts).all()
     assert (sizes[counts >= 256] <= 1.25 * counts[counts >= 256]).all()
     assert len(np.unique(sizes)) < 45
+
+
+def test_the_last_width_is_used_where_a_wider_one_stands_still():
+    cloud = index_cloud(np.random.default_rng(0).normal(size=(70, 3)), neighbors=5)
+    start = RigidTransform(np.eye(3), np.zeros(3))  # the right pose: no width moves it
+    options = {"thickness": 0.01, "edges": False, "both_directions": False, "tolerance": 1e-5}
+    weighting = Weighting("geman_mcclure", None, np.inf, 1.0)
+    for widths, steps in (([8.0, 1.0], 2), ([8.0, 4.0, 2.0, 1.0], 3), ([1.0, 1.0], 1)):
+        _, taken, converged, _ = iterate(
+            start, cloud, cloud, weighting, np.array(widths, np.float32), method="gicp", **options
+        )
+        assert (taken, converged) == (steps, True)
 
 
 @pytest.mark.parametrize("both_directions", [False, True])

@@ -48,6 +48,26 @@ FREE = {
 }
 
 
+def test_about_another_centre_it_says_the_same_of_every_point(seed):
+    rng = np.random.default_rng(seed)
+    cloud = jnp.asarray(shapes(rng)["box"] + 0.01 * rng.normal(size=(800, 3)))
+    here = pose_uncertainty(rigid.identity(cloud.dtype), cloud, cloud[::2])
+    there = rooms.about(here, rng.normal(size=3))
+
+    def of_a_point(uncertainty, point):
+        """Covariance of the displacement ``omega x (point - centre) + v``."""
+        turning = np.cross(np.eye(3), point - np.asarray(uncertainty.centre)).T
+        rows = np.concatenate([turning, np.eye(3)], axis=1)
+        return rows @ np.asarray(uncertainty.covariance) @ rows.T
+
+    for point in rng.normal(size=(5, 3)):
+        np.testing.assert_allclose(of_a_point(there, point), of_a_point(here, point), rtol=1e-9)
+    np.testing.assert_allclose(
+        there.information @ there.covariance, there.variance * np.eye(6), atol=1e-9
+    )
+    assert not np.allclose(there.covariance, here.covariance, atol=0)
+
+
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("name", FREE)
 def test_free_motions_are_named(name, factor, seed):

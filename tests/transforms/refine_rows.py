@@ -92,11 +92,11 @@ def small_parts() -> dict[str, Row]:
             (points() * [1.0, 1.0, 0.1], graph),
             every(lambda x: (x, graph)),
         ),
-        "normals.plane_covariances": Row(
-            functools.partial(normals.plane_covariances, thickness=0.01), (points(),)
-        ),
         "normals.surface_covariances": Row(
-            functools.partial(normals.surface_covariances, thickness=0.01),
+            lambda n, e: normals.surface_covariances(n, 0.01, e), (points(), points())
+        ),
+        "normals.edge_normals": Row(
+            lambda x, i: normals.edge_normals(x, i, normals.normals(x, i)),
             (points() * [1.0, 1.0, 0.1], graph),
             every(lambda x: (x, graph)),
         ),

@@ -25,7 +25,7 @@ from tests.transforms.rows import Row
 
 HOST = {"config.load_config", "pretrained.available_weights", "pretrained.load_pretrained"}
 HOST |= {"register.register", "refine.frame.check_clouds", "refine.pairing.check_options"}
-HOST |= {"refine.uncertainty.weak_directions"}
+HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 """Functions that read files or numpy arrays on the host: no transform applies to them."""
 HALVES = {"matching.gather_rows", "matching.collect_rows"}
 """Of `neighborhood_sum` and of its transpose, which knows one as the derivative of the other."""
