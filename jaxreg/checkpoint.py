@@ -45,20 +45,27 @@ class Run:
     def restore(self, state: Any) -> Any:
         """The newest state of the run, or `state` when there is none.
 
+        What was logged after it is forgotten, for it will be logged again. A run that was stopped
+        before its first checkpoint has nothing to lose: it starts anew, with any configuration.
+
         Raises:
-          ValueError: the run was made with another configuration.
+          ValueError: the checkpoints were made with another configuration, hold other arrays than
+            `state`, or cannot be read.
         """
-        if self._latest.latest_step() is None:
-            return state
-        saved = _saved_config(self._latest)[0]
-        if saved != self.config:
-            raise ValueError(
-                f"{self.directory} holds a run of another configuration "
-                f"({_difference(saved, self.config)}): choose another --workdir, or the same values."
-            )
-        restored = _restore(self._latest, state)
-        self._forget_after(self._latest.latest_step())
-        return restored
+        newest, best = self._latest.latest_step(), self._best.latest_step()
+        # Killed during the first save, a run has a best state and no newest one.
+        if newest is not None or best is not None:
+            saved = _saved_config(self._best if newest is None else self._latest)[0]
+            if saved != self.config:
+                raise ValueError(
+                    f"{self.directory} holds a run of another configuration "
+                    f"({_difference(saved, self.config)}): choose another --workdir, or the same "
+                    "values."
+                )
+        if newest is not None:
+            state = _restore(self._latest, state)
+        self._forget_after(newest or 0)
+        return state
 
     def log(self, entry: dict[str, float]) -> None:
         """Append one object to `metrics.jsonl`."""
@@ -78,14 +85,15 @@ class Run:
         return np.inf if self._best.latest_step() is None else _saved_config(self._best)[1]
 
     def _forget_after(self, step: int) -> None:
-        """Drop logged steps that will be run again."""
+        """Drop logged steps that will be run again, and what a killed run left of a line."""
         path = self.directory / "metrics.jsonl"
         if path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-            # A run that was killed while it wrote leaves half a line.
-            whole = [line for line in lines if line.endswith("}\n")]
-            kept = "".join(line for line in whole if json.loads(line)["step"] <= step)
-            path.write_text(kept, encoding="utf-8")
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            kept = [line + "\n" for line in lines if _logged_step(line) <= step]
+            # Replaced at once: killed while it writes, this run would lose the lines of the others.
+            part = path.with_suffix(".part")
+            part.write_text("".join(kept), encoding="utf-8")
+            part.replace(path)
 
 
 @contextlib.contextmanager
@@ -140,6 +148,14 @@ def _restore(manager: ocp.CheckpointManager, state: Any) -> Any:
             f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg "
             "writes: evaluate or resume it with the version that trained it, or train again."
         ) from error
+
+
+def _logged_step(line: str) -> float:
+    """The step of a line of `metrics.jsonl`; infinity where a killed run left the line unfinished."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, TypeError, KeyError):
+        return np.inf
 
 
 def _difference(saved: Config, wanted: Config) -> str:

@@ -166,7 +166,8 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
 
     Writes `metrics.jsonl` (one object a line), the newest and the best checkpoint. The error that
     chooses is the mean geodesic rotation error of the validation pairs, which are made from shapes
-    that are not trained on.
+    that are not trained on. A run that was stopped goes on from its last validation; one that was
+    stopped before the first has nothing to lose and starts anew, with any configuration.
 
     Raises:
       ValueError: the data is missing, or `workdir` holds a run of another configuration.

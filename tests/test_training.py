@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -163,3 +164,70 @@ def test_a_checkpoint_with_other_arrays_is_an_error_that_says_so(config, tmp_pat
         run.save(1, {"weights": jnp.zeros(3)}, error=1.0)
     with pytest.raises(ValueError, match="other arrays than this version"):
         training.load_checkpoint(tmp_path)
+
+
+def entries(workdir) -> list[dict]:
+    lines = (workdir / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def other(config: Config) -> Config:
+    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, beta=0.5))
+
+
+def test_a_run_stopped_before_its_first_checkpoint_starts_anew(config, tmp_path):
+    start = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.log({"step": 1, "loss": 3.0})
+        run.log({"step": 2, "loss": 2.0})
+    with (tmp_path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"step": 3, "lo')  # Killed while it wrote.
+    with checkpoint.open_run(tmp_path, other(config)) as run:
+        assert run.restore(start) is start
+        run.log({"step": 1, "loss": 4.0})
+    assert entries(tmp_path) == [{"step": 1, "loss": 4.0}]
+
+
+def test_a_log_that_an_earlier_version_left_in_pieces_is_mended(config, tmp_path):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(2, state, error=1.0)
+    pieces = ['{"step": 1}', '{"step": 2, "lo{"step": 1}', "[2]", "\udcff", '{"step": 2}', '{"st']
+    text = "\n".join(pieces)
+    (tmp_path / "metrics.jsonl").write_text(text, encoding="utf-8", errors="surrogateescape")
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.restore(state)
+    assert entries(tmp_path) == [{"step": 1}, {"step": 2}]
+
+
+def test_a_log_is_whole_even_where_the_run_is_killed_while_it_mends_it(
+    config, tmp_path, monkeypatch
+):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(1, state, error=1.0)
+        run.log({"step": 1})
+        run.log({"step": 2})
+
+    def killed(path, target):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, checkpoint.open_run(tmp_path, config) as run:
+        patched.setattr(type(tmp_path), "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run.restore(state)
+    assert entries(tmp_path) == [{"step": 1}, {"step": 2}]
+
+
+def test_killed_in_its_first_save_a_run_keeps_its_configuration(config, tmp_path):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(1, state, error=1.0)
+    shutil.rmtree(tmp_path / "latest")  # The best state is there, the newest was not finished.
+    with (
+        checkpoint.open_run(tmp_path, other(config)) as run,
+        pytest.raises(ValueError, match=r"loss.beta: 0.01 there, 0.5 here"),
+    ):
+        run.restore(state)
+    with checkpoint.open_run(tmp_path, config) as run:
+        assert run.restore(state) is state
