@@ -4,8 +4,11 @@ A step depends on the state and the seed only: its pairs derive from ``fold_in(s
 that was interrupted and resumed is therefore bit-equal to one that was not.
 """
 
+import dataclasses
 import functools
 import json
+import math
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,9 +173,11 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     stopped before the first has nothing to lose and starts anew, with any configuration.
 
     Raises:
-      ValueError: the data is missing, or `workdir` holds a run of another configuration.
+      ValueError: `config.train` holds a number that makes no sense, the data is missing, or
+        `workdir` holds a run of another configuration.
       FloatingPointError: the loss is not finite; says at which step. What was saved stays.
     """
+    _check_options(config.train)
     shapes, _ = load_shapes(
         config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
     )
@@ -208,6 +213,26 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
             run.log(entry)
             progress(entry)
         return run.best(state).average
+
+
+_LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
+"""The smallest sensible value of these settings; the others must not be negative."""
+_POSITIVE = ("learning_rate", "clip")
+
+
+def _check_options(config: TrainConfig) -> None:
+    for name, value in dataclasses.asdict(config).items():
+        least = _LEAST.get(name, 0)
+        most = {"ema": 1.0, "clip": math.inf}.get(name, sys.float_info.max)
+        if least <= value <= most and (value > 0 or name not in _POSITIVE):
+            continue
+        bound = "positive" if name in _POSITIVE else f"at least {least}"
+        if name != "clip" and isinstance(value, float):
+            bound += " and at most 1" if name == "ema" else " and finite"
+        raise ValueError(
+            f"train.{name} must be {bound}, got {value}: correct it in the configuration file or by "
+            f"--train.{name.replace('_', '-')}."
+        )
 
 
 def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:

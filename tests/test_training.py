@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxreg import checkpoint, training
-from jaxreg.config import Config, from_dict
+from jaxreg.config import Config, TrainConfig, from_dict
 from jaxreg.types import RigidTransform
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -231,3 +231,40 @@ def test_killed_in_its_first_save_a_run_keeps_its_configuration(config, tmp_path
         run.restore(state)
     with checkpoint.open_run(tmp_path, config) as run:
         assert run.restore(state) is state
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize(
+    ("name", "value", "bound"),
+    [
+        ("steps", 0, "at least 1"),
+        ("batch", 0, "at least 1"),
+        ("validate_every", 0, "at least 1"),
+        ("validation_pairs", -1, "at least 1"),
+        ("warmup", -1, "at least 0"),
+        ("seed", -1, "at least 0"),
+        ("learning_rate", 0.0, "positive"),
+        ("learning_rate", float("nan"), "positive"),
+        ("final_learning_rate", -1e-5, "at least 0"),
+        ("weight_decay", float("inf"), "at least 0 and finite"),
+        ("clip", 0.0, "positive"),
+        ("ema", 1.5, "at least 0 and at most 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_before_the_work(
+    config, tmp_path, name, value, bound
+):
+    wrong = dataclasses.replace(config, train=dataclasses.replace(config.train, **{name: value}))
+    option = f"--train.{name.replace('_', '-')}"
+    with pytest.raises(ValueError, match=rf"train.{name} must be {bound}.*, got {value}.*{option}"):
+        training.train(wrong, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_settings_at_the_end_of_their_range_are_taken():
+    training._check_options(
+        TrainConfig(
+            steps=1, batch=1, validate_every=1, validation_pairs=1, warmup=0, weight_decay=0.0,
+            final_learning_rate=0.0, clip=float("inf"), ema=1.0, seed=0,
+        )
+    )  # fmt: skip
