@@ -5,7 +5,7 @@ Released weights are in `pretrained`.
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,8 @@ class Run:
                     "values."
                 )
         if newest is not None:
-            state = _restore(self._latest, state)
+            abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
+            state = _restore(self._latest, abstract, ocp.args.StandardRestore(abstract))
         self._forget_after(newest or 0)
         return state
 
@@ -71,10 +72,6 @@ class Run:
         """Append one object to `metrics.jsonl`."""
         with (self.directory / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
-
-    def best(self, state: Any) -> Any:
-        """The state with the lowest validation error; the given `state` tells the structure."""
-        return _restore(self._best, state)
 
     def close(self) -> None:
         """Wait for what is still being written."""
@@ -114,6 +111,27 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
     Raises:
       ValueError: there is no checkpoint.
     """
+    with _open_best(workdir) as manager:
+        return _saved_config(manager)
+
+
+def restore_best(workdir: str | Path, wanted: dict[str, Any]) -> dict[str, Any]:
+    """Parts of the best state in `workdir` as numpy arrays; nothing is written, nothing else read.
+
+    `wanted` holds, by the names of the parts in the state, trees of anything with the shapes and the
+    dtypes that they must have.
+
+    Raises:
+      ValueError: there is no checkpoint, or it has other arrays than `wanted`, or it cannot be read.
+    """
+    as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+    arguments = ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
+    with _open_best(workdir) as manager:
+        return _restore(manager, wanted, arguments, parts=wanted)
+
+
+@contextlib.contextmanager
+def _open_best(workdir: str | Path) -> Iterator[ocp.CheckpointManager]:
     directory = Path(workdir).resolve() / "best"
     if not directory.is_dir():
         raise ValueError(
@@ -125,7 +143,7 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
             raise ValueError(
                 f"{directory} holds no finished checkpoint: let train.py validate once."
             )
-        return _saved_config(manager)
+        yield manager
 
 
 def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
@@ -138,16 +156,41 @@ def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
     return configuration.from_dict(saved, where=str(manager.directory)), error
 
 
-def _restore(manager: ocp.CheckpointManager, state: Any) -> Any:
-    abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
-    wanted = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+def _restore(
+    manager: ocp.CheckpointManager,
+    wanted: Any,
+    arguments: Any,
+    *,
+    parts: Container[str] | None = None,
+) -> Any:
+    """What `arguments` ask of the newest state. Its arrays (of `parts`) must be as `wanted`."""
+    step = manager.latest_step()
     try:
-        return manager.restore(manager.latest_step(), args=wanted)["state"]
-    except ValueError as error:
+        with contextlib.closing(ocp.StandardCheckpointHandler()) as handler:
+            saved = handler.metadata(manager.directory / str(step) / "state").tree
+        there, here = _arrays(saved), _arrays(wanted)
+        if parts is not None:
+            there = {name: form for name, form in there.items() if name[0] in parts}
+        if there == here:
+            return manager.restore(step, args=ocp.args.Composite(state=arguments))["state"]
+    except (ValueError, OSError) as error:
+        reason = str(error).partition("\n")[0]
         raise ValueError(
-            f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg "
-            "writes: evaluate or resume it with the version that trained it, or train again."
+            f"the checkpoint in {manager.directory} cannot be read ({reason}): put a whole copy in "
+            "its place, or train again in another --workdir."
         ) from error
+    name = min(name for name, _ in there.items() ^ here.items())
+    raise ValueError(
+        f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg writes "
+        f"({'/'.join(name)}: {there.get(name, 'none')} there, {here.get(name, 'none')} here): "
+        "evaluate or resume it with the version that trained it, or train again."
+    )
+
+
+def _arrays(tree: Any) -> dict[tuple[str, ...], str]:
+    """Dtype and shape of every array of a tree, by its path; what else a tree holds is no array."""
+    leaves = ocp.tree.to_flat_dict(tree).items()
+    return {k: f"{np.dtype(x.dtype)}{list(x.shape)}" for k, x in leaves if hasattr(x, "shape")}
 
 
 def _logged_step(line: str) -> float:

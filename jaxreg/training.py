@@ -212,7 +212,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
                 run.save(number, state, entry["val_mie_r_deg"])
             run.log(entry)
             progress(entry)
-        return run.best(state).average
+    return load_checkpoint(workdir)[0]
 
 
 _LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
@@ -236,14 +236,22 @@ def _check_options(config: TrainConfig) -> None:
 
 
 def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
-    """The best (averaged) variables of a run, and its configuration.
+    """The best (averaged) variables of a run, and its configuration; the run is only read.
 
     Raises:
-      ValueError: there is no checkpoint in `workdir`.
+      ValueError: there is no checkpoint in `workdir`, or it holds other arrays than a network of
+        this version, or it cannot be read.
     """
+    return _load_best(workdir)[:2]
+
+
+def _load_best(workdir: str | Path) -> tuple[Variables, Config, int]:
+    """The same, and the step. Nothing of the optimiser is read, which other versions may change."""
     config, _ = checkpoint.best_config(workdir)
-    with checkpoint.open_run(workdir, config) as run:
-        return run.best(create_train_state(config)).average, config
+    average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config.model))
+    step = jax.ShapeDtypeStruct((), jnp.int32)
+    best = checkpoint.restore_best(workdir, {"step": step, "average": average})
+    return jax.tree.map(jnp.asarray, best["average"]), config, int(best["step"])
 
 
 def release(

@@ -268,3 +268,38 @@ def test_settings_at_the_end_of_their_range_are_taken():
             final_learning_rate=0.0, clip=float("inf"), ema=1.0, seed=0,
         )
     )  # fmt: skip
+
+
+def test_a_run_of_another_optimiser_is_evaluated_and_only_read(config, tmp_path):
+    state = training.create_train_state(config)
+    changed = state._replace(optimizer={"momentum": jnp.zeros(7)})
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, changed, error=1.0)
+    shutil.rmtree(tmp_path / "latest")
+    files = sorted(tmp_path.rglob("*"))
+    variables, saved = training.load_checkpoint(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, variables, state.average)
+    assert saved == config
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_a_run_of_another_optimiser_is_not_resumed(config, tmp_path):
+    state = training.create_train_state(config)
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, state._replace(optimizer={"momentum": jnp.zeros(7)}), error=1.0)
+    message = r"other arrays than this version .*\(optimizer/.* there, .* here\)"
+    with (
+        checkpoint.open_run(tmp_path, config) as run,
+        pytest.raises(ValueError, match=message),
+    ):
+        run.restore(state)
+
+
+def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, training.create_train_state(config), error=1.0)
+    for path in (tmp_path / "best" / "3" / "state").rglob("*"):
+        if path.is_file() and "METADATA" not in path.name:
+            path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"best cannot be read \(.*\): put a whole copy"):
+        training.load_checkpoint(tmp_path)
