@@ -5,6 +5,7 @@ Released weights are in `pretrained`.
 
 import contextlib
 import json
+import os
 from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,16 @@ class Run:
             part = path.with_suffix(".part")
             part.write_text("".join(kept), encoding="utf-8")
             part.replace(path)
+
+
+def check_place(workdir: str | Path) -> None:
+    """Raises ValueError unless `workdir` is a directory to write to, or can be made."""
+    directory = Path(workdir).resolve()
+    place = next(path for path in (directory, *directory.parents) if path.exists())
+    if not place.is_dir():
+        raise ValueError(f"{place} is a file: name a directory by --workdir.")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ValueError(f"{place} cannot be written to: choose another --workdir.")
 
 
 @contextlib.contextmanager

@@ -6,7 +6,6 @@ that was interrupted and resumed is therefore bit-equal to one that was not.
 
 import dataclasses
 import functools
-import json
 import math
 import sys
 from pathlib import Path
@@ -20,15 +19,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg import checkpoint, report, rigid
 from jaxreg.compilation import jit
-from jaxreg.config import Config, PairConfig, TrainConfig
-from jaxreg.data import dataset_label, load_shapes
+from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
+from jaxreg.data import dataset_label, icl_nuim, load_shapes
 from jaxreg.data.pairs import make_pair
 from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
 from jaxreg.losses import pose_error, step_losses, total_loss
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.model import Variables, init_variables, iterate
-from jaxreg.pretrained import save_weights
+from jaxreg.pictures import read_metrics
+from jaxreg.pretrained import check_new_name, save_weights
 from jaxreg.types import Pair, PointCloud
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
@@ -173,11 +173,12 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     stopped before the first has nothing to lose and starts anew, with any configuration.
 
     Raises:
-      ValueError: `config.train` holds a number that makes no sense, the data is missing, or
-        `workdir` holds a run of another configuration.
+      ValueError: `config.train` holds a number that makes no sense, `workdir` cannot be written to,
+        the data is missing, or `workdir` holds a run of another configuration.
       FloatingPointError: the loss is not finite; says at which step. What was saved stays.
     """
     _check_options(config.train)
+    checkpoint.check_place(workdir)
     shapes, _ = load_shapes(
         config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
     )
@@ -260,20 +261,48 @@ def release(
     """Write the best weights of a run into the package, with a card of how they were made.
 
     The data is called by what is found in `root`, so that a stand-in is not taken for the original.
+
+    Raises:
+      ValueError: `name` is not a plain one or is taken, `workdir` holds no checkpoint, or its log
+        lacks the step of the best one.
     """
-    variables, config = load_checkpoint(workdir)
-    _, error = checkpoint.best_config(workdir)
-    lines = (Path(workdir) / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    entries = [json.loads(line) for line in lines]
-    best = next(entry for entry in entries if entry.get("val_mie_r_deg") == error)
+    check_new_name(name)
+    variables, config, step = _load_best(workdir)
+    log = Path(workdir) / "metrics.jsonl"
+    metrics = read_metrics(log)
+    rows = np.flatnonzero(metrics["step"] == step)
+    if len(rows) == 0:
+        # A run that is killed between the two has saved the step and not logged it.
+        raise ValueError(
+            f"{log} lacks step {step}, that of the best checkpoint: let the command of train.py that "
+            "made the run finish."
+        )
     card = {
         "command": command,
-        "data": f"{dataset_label(config.data, root)}, training shapes: {config.data.train_categories}",
+        "data": _training_data(config.data, root),
         "seed": config.train.seed,
-        "step": best["step"],
-        "validation": {k.removeprefix("val_"): v for k, v in best.items() if k[:4] == "val_"},
+        "step": step,
+        "validation": {
+            key.removeprefix("val_"): float(values[rows[-1]])
+            for key, values in metrics.items()
+            if key.startswith("val_")
+        },
     }
     save_weights(Path(__file__).parent / "weights", name, variables, config, card)
+
+
+def _training_data(config: DataConfig, root: str | Path | None) -> str:
+    """What a card calls the shapes trained on; `config.label` names those tested on."""
+    match config.name:
+        case "folder":
+            return f"folder {config.folder}"
+        case "icl_nuim" if root is not None:
+            place = icl_nuim.find_file(root, "train").parent.parent
+            return "icl_nuim" if place == Path(root) else place.name
+    found = dataset_label(dataclasses.replace(config, label=""), root)
+    if config.name == "modelnet40":
+        return f"{found}, training shapes: {config.train_categories}"
+    return found
 
 
 def shape_points(pairs: PairConfig) -> int:
