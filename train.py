@@ -5,6 +5,8 @@ checkpoint by validation error.
 """
 
 import dataclasses
+import shlex
+import sys
 from typing import Annotated
 
 import tyro
@@ -12,8 +14,9 @@ import tyro
 from jaxreg.compilation import enable_compilation_cache, restart_with_huge_pages
 from jaxreg.config import Config
 from jaxreg.data import data_root
-from jaxreg.options import parse, stop
+from jaxreg.options import parse, stop, told
 from jaxreg.pictures import plot_curves
+from jaxreg.pretrained import check_new_name
 from jaxreg.training import release, train
 
 
@@ -25,7 +28,8 @@ class Options:
     workdir: str = ""
     """Directory of the run; one that holds a run is resumed."""
     release: str = ""
-    """Write the best weights to jaxreg/weights under this name, with a card of how they were made."""
+    """Write the best weights to jaxreg/weights under this new name, with a card of how they were
+    made."""
     data_root: str = ""
     """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
 
@@ -35,17 +39,21 @@ def main() -> None:
     path, options = parse(Options, description=__doc__)
     workdir = options.workdir or f"runs/{path.stem}"
     enable_compilation_cache()
+    trained = ""
     try:
+        if options.release:
+            check_new_name(options.release)
         root = data_root(options.data_root, path)
         train(options.config, workdir, root=root)
-    except (ValueError, FloatingPointError) as error:
-        stop(str(error))
+        trained = f" ({workdir} holds the whole run: the same command does the rest)"
+        plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
+        if options.release:
+            command = shlex.join(["python", "train.py", *sys.argv[1:]])
+            release(options.release, workdir, command, root=root)
+    except (ValueError, FloatingPointError, OSError) as error:
+        stop(told(error) + trained)
     except KeyboardInterrupt:
-        stop("interrupted: the same command goes on from the newest checkpoint", status=130)
-    plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
-    if options.release:
-        command = f"python train.py {path} --workdir {workdir}"
-        release(options.release, workdir, command, root=root)
+        stop("interrupted: the same command goes on from the last validation", status=130)
     print(f"best checkpoint, metrics.jsonl and curves.png: {workdir}")
 
 

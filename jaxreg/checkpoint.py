@@ -5,7 +5,8 @@ Released weights are in `pretrained`.
 
 import contextlib
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,29 +46,33 @@ class Run:
     def restore(self, state: Any) -> Any:
         """The newest state of the run, or `state` when there is none.
 
+        What was logged after it is forgotten, for it will be logged again. A run that was stopped
+        before its first checkpoint has nothing to lose: it starts anew, with any configuration.
+
         Raises:
-          ValueError: the run was made with another configuration.
+          ValueError: the checkpoints were made with another configuration, hold other arrays than
+            `state`, or cannot be read.
         """
-        if self._latest.latest_step() is None:
-            return state
-        saved = _saved_config(self._latest)[0]
-        if saved != self.config:
-            raise ValueError(
-                f"{self.directory} holds a run of another configuration "
-                f"({_difference(saved, self.config)}): choose another --workdir, or the same values."
-            )
-        restored = _restore(self._latest, state)
-        self._forget_after(self._latest.latest_step())
-        return restored
+        newest, best = self._latest.latest_step(), self._best.latest_step()
+        # Killed during the first save, a run has a best state and no newest one.
+        if newest is not None or best is not None:
+            saved = _saved_config(self._best if newest is None else self._latest)[0]
+            if saved != self.config:
+                raise ValueError(
+                    f"{self.directory} holds a run of another configuration "
+                    f"({_difference(saved, self.config)}): choose another --workdir, or the same "
+                    "values."
+                )
+        if newest is not None:
+            abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
+            state = _restore(self._latest, abstract, ocp.args.StandardRestore(abstract))
+        self._forget_after(newest or 0)
+        return state
 
     def log(self, entry: dict[str, float]) -> None:
         """Append one object to `metrics.jsonl`."""
         with (self.directory / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
-
-    def best(self, state: Any) -> Any:
-        """The state with the lowest validation error; the given `state` tells the structure."""
-        return _restore(self._best, state)
 
     def close(self) -> None:
         """Wait for what is still being written."""
@@ -78,14 +83,25 @@ class Run:
         return np.inf if self._best.latest_step() is None else _saved_config(self._best)[1]
 
     def _forget_after(self, step: int) -> None:
-        """Drop logged steps that will be run again."""
+        """Drop logged steps that will be run again, and what a killed run left of a line."""
         path = self.directory / "metrics.jsonl"
         if path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-            # A run that was killed while it wrote leaves half a line.
-            whole = [line for line in lines if line.endswith("}\n")]
-            kept = "".join(line for line in whole if json.loads(line)["step"] <= step)
-            path.write_text(kept, encoding="utf-8")
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            kept = [line + "\n" for line in lines if _logged_step(line) <= step]
+            # Replaced at once: killed while it writes, this run would lose the lines of the others.
+            part = path.with_suffix(".part")
+            part.write_text("".join(kept), encoding="utf-8")
+            part.replace(path)
+
+
+def check_place(workdir: str | Path) -> None:
+    """Raises ValueError unless `workdir` is a directory to write to, or can be made."""
+    directory = Path(workdir).resolve()
+    place = next(path for path in (directory, *directory.parents) if path.exists())
+    if not place.is_dir():
+        raise ValueError(f"{place} is a file: name a directory by --workdir.")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ValueError(f"{place} cannot be written to: choose another --workdir.")
 
 
 @contextlib.contextmanager
@@ -106,6 +122,27 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
     Raises:
       ValueError: there is no checkpoint.
     """
+    with _open_best(workdir) as manager:
+        return _saved_config(manager)
+
+
+def restore_best(workdir: str | Path, wanted: dict[str, Any]) -> dict[str, Any]:
+    """Parts of the best state in `workdir` as numpy arrays; nothing is written, nothing else read.
+
+    `wanted` holds, by the names of the parts in the state, trees of anything with the shapes and the
+    dtypes that they must have.
+
+    Raises:
+      ValueError: there is no checkpoint, or it has other arrays than `wanted`, or it cannot be read.
+    """
+    as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+    arguments = ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
+    with _open_best(workdir) as manager:
+        return _restore(manager, wanted, arguments, parts=wanted)
+
+
+@contextlib.contextmanager
+def _open_best(workdir: str | Path) -> Iterator[ocp.CheckpointManager]:
     directory = Path(workdir).resolve() / "best"
     if not directory.is_dir():
         raise ValueError(
@@ -117,7 +154,7 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
             raise ValueError(
                 f"{directory} holds no finished checkpoint: let train.py validate once."
             )
-        return _saved_config(manager)
+        yield manager
 
 
 def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
@@ -130,16 +167,49 @@ def _saved_config(manager: ocp.CheckpointManager) -> tuple[Config, float]:
     return configuration.from_dict(saved, where=str(manager.directory)), error
 
 
-def _restore(manager: ocp.CheckpointManager, state: Any) -> Any:
-    abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, state)
-    wanted = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+def _restore(
+    manager: ocp.CheckpointManager,
+    wanted: Any,
+    arguments: Any,
+    *,
+    parts: Container[str] | None = None,
+) -> Any:
+    """What `arguments` ask of the newest state. Its arrays (of `parts`) must be as `wanted`."""
+    step = manager.latest_step()
     try:
-        return manager.restore(manager.latest_step(), args=wanted)["state"]
-    except ValueError as error:
+        with contextlib.closing(ocp.StandardCheckpointHandler()) as handler:
+            saved = handler.metadata(manager.directory / str(step) / "state").tree
+        there, here = _arrays(saved), _arrays(wanted)
+        if parts is not None:
+            there = {name: form for name, form in there.items() if name[0] in parts}
+        if there == here:
+            return manager.restore(step, args=ocp.args.Composite(state=arguments))["state"]
+    except (ValueError, OSError) as error:
+        reason = str(error).partition("\n")[0]
         raise ValueError(
-            f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg "
-            "writes: evaluate or resume it with the version that trained it, or train again."
+            f"the checkpoint in {manager.directory} cannot be read ({reason}): put a whole copy in "
+            "its place, or train again in another --workdir."
         ) from error
+    name = min(name for name, _ in there.items() ^ here.items())
+    raise ValueError(
+        f"the checkpoint in {manager.directory} has other arrays than this version of jaxreg writes "
+        f"({'/'.join(name)}: {there.get(name, 'none')} there, {here.get(name, 'none')} here): "
+        "evaluate or resume it with the version that trained it, or train again."
+    )
+
+
+def _arrays(tree: Any) -> dict[tuple[str, ...], str]:
+    """Dtype and shape of every array of a tree, by its path; what else a tree holds is no array."""
+    leaves = ocp.tree.to_flat_dict(tree).items()
+    return {k: f"{np.dtype(x.dtype)}{list(x.shape)}" for k, x in leaves if hasattr(x, "shape")}
+
+
+def _logged_step(line: str) -> float:
+    """The step of a line of `metrics.jsonl`; infinity where a killed run left the line unfinished."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, TypeError, KeyError):
+        return np.inf
 
 
 def _difference(saved: Config, wanted: Config) -> str:

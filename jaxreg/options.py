@@ -38,3 +38,10 @@ def stop(message: str, *, status: int = 2) -> NoReturn:
     """End the program with one message: status 2 for bad input, as `jaxreg` does."""
     print(f"error: {message}" if status == 2 else message, file=sys.stderr)  # noqa: T201
     raise SystemExit(status)
+
+
+def told(error: Exception) -> str:
+    """What an error says: of a file that could not be read or written, which one and why."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)

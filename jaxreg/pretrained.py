@@ -6,6 +6,7 @@ The card holds the configuration, the data and command of the training, and the 
 import dataclasses
 import io
 import json
+import re
 import zipfile
 from importlib import resources
 from pathlib import Path
@@ -25,6 +26,20 @@ def available_weights() -> tuple[str, ...]:
         return ()
     names = (item.name for item in folder.iterdir())
     return tuple(sorted(name.removesuffix(".npz") for name in names if name.endswith(".npz")))
+
+
+def check_new_name(name: str) -> None:
+    """Raises ValueError unless weights can be released as `name`: a plain name that is not taken.
+
+    To replace released weights, delete their two files first.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise ValueError(f"weights cannot be called {name!r}: use letters, digits, _ and - only.")
+    if name in available_weights():
+        raise ValueError(
+            f"there are weights '{name}' already: choose another name, or delete {name}.npz and "
+            f"{name}.json in {resources.files('jaxreg') / 'weights'} to replace them."
+        )
 
 
 def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:

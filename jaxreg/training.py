@@ -4,8 +4,10 @@ A step depends on the state and the seed only: its pairs derive from ``fold_in(s
 that was interrupted and resumed is therefore bit-equal to one that was not.
 """
 
+import dataclasses
 import functools
-import json
+import math
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,15 +19,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg import checkpoint, report, rigid
 from jaxreg.compilation import jit
-from jaxreg.config import Config, PairConfig, TrainConfig
-from jaxreg.data import dataset_label, load_shapes
+from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
+from jaxreg.data import dataset_label, icl_nuim, load_shapes
 from jaxreg.data.pairs import make_pair
 from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
 from jaxreg.losses import pose_error, step_losses, total_loss
 from jaxreg.metrics import evaluate_transforms
 from jaxreg.model import Variables, init_variables, iterate
-from jaxreg.pretrained import save_weights
+from jaxreg.pictures import read_metrics
+from jaxreg.pretrained import check_new_name, save_weights
 from jaxreg.types import Pair, PointCloud
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
@@ -166,12 +169,16 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
 
     Writes `metrics.jsonl` (one object a line), the newest and the best checkpoint. The error that
     chooses is the mean geodesic rotation error of the validation pairs, which are made from shapes
-    that are not trained on.
+    that are not trained on. A run that was stopped goes on from its last validation; one that was
+    stopped before the first has nothing to lose and starts anew, with any configuration.
 
     Raises:
-      ValueError: the data is missing, or `workdir` holds a run of another configuration.
+      ValueError: `config.train` holds a number that makes no sense, `workdir` cannot be written to,
+        the data is missing, or `workdir` holds a run of another configuration.
       FloatingPointError: the loss is not finite; says at which step. What was saved stays.
     """
+    _check_options(config.train)
+    checkpoint.check_place(workdir)
     shapes, _ = load_shapes(
         config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
     )
@@ -206,18 +213,46 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
                 run.save(number, state, entry["val_mie_r_deg"])
             run.log(entry)
             progress(entry)
-        return run.best(state).average
+    return load_checkpoint(workdir)[0]
+
+
+_LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
+"""The smallest sensible value of these settings; the others must not be negative."""
+_POSITIVE = ("learning_rate", "clip")
+
+
+def _check_options(config: TrainConfig) -> None:
+    for name, value in dataclasses.asdict(config).items():
+        least = _LEAST.get(name, 0)
+        most = {"ema": 1.0, "clip": math.inf}.get(name, sys.float_info.max)
+        if least <= value <= most and (value > 0 or name not in _POSITIVE):
+            continue
+        bound = "positive" if name in _POSITIVE else f"at least {least}"
+        if name != "clip" and isinstance(value, float):
+            bound += " and at most 1" if name == "ema" else " and finite"
+        raise ValueError(
+            f"train.{name} must be {bound}, got {value}: correct it in the configuration file or by "
+            f"--train.{name.replace('_', '-')}."
+        )
 
 
 def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
-    """The best (averaged) variables of a run, and its configuration.
+    """The best (averaged) variables of a run, and its configuration; the run is only read.
 
     Raises:
-      ValueError: there is no checkpoint in `workdir`.
+      ValueError: there is no checkpoint in `workdir`, or it holds other arrays than a network of
+        this version, or it cannot be read.
     """
+    return _load_best(workdir)[:2]
+
+
+def _load_best(workdir: str | Path) -> tuple[Variables, Config, int]:
+    """The same, and the step. Nothing of the optimiser is read, which other versions may change."""
     config, _ = checkpoint.best_config(workdir)
-    with checkpoint.open_run(workdir, config) as run:
-        return run.best(create_train_state(config)).average, config
+    average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config.model))
+    step = jax.ShapeDtypeStruct((), jnp.int32)
+    best = checkpoint.restore_best(workdir, {"step": step, "average": average})
+    return jax.tree.map(jnp.asarray, best["average"]), config, int(best["step"])
 
 
 def release(
@@ -226,20 +261,48 @@ def release(
     """Write the best weights of a run into the package, with a card of how they were made.
 
     The data is called by what is found in `root`, so that a stand-in is not taken for the original.
+
+    Raises:
+      ValueError: `name` is not a plain one or is taken, `workdir` holds no checkpoint, or its log
+        lacks the step of the best one.
     """
-    variables, config = load_checkpoint(workdir)
-    _, error = checkpoint.best_config(workdir)
-    lines = (Path(workdir) / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    entries = [json.loads(line) for line in lines]
-    best = next(entry for entry in entries if entry.get("val_mie_r_deg") == error)
+    check_new_name(name)
+    variables, config, step = _load_best(workdir)
+    log = Path(workdir) / "metrics.jsonl"
+    metrics = read_metrics(log)
+    rows = np.flatnonzero(metrics["step"] == step)
+    if len(rows) == 0:
+        # A run that is killed between the two has saved the step and not logged it.
+        raise ValueError(
+            f"{log} lacks step {step}, that of the best checkpoint: let the command of train.py that "
+            "made the run finish."
+        )
     card = {
         "command": command,
-        "data": f"{dataset_label(config.data, root)}, training shapes: {config.data.train_categories}",
+        "data": _training_data(config.data, root),
         "seed": config.train.seed,
-        "step": best["step"],
-        "validation": {k.removeprefix("val_"): v for k, v in best.items() if k[:4] == "val_"},
+        "step": step,
+        "validation": {
+            key.removeprefix("val_"): float(values[rows[-1]])
+            for key, values in metrics.items()
+            if key.startswith("val_")
+        },
     }
     save_weights(Path(__file__).parent / "weights", name, variables, config, card)
+
+
+def _training_data(config: DataConfig, root: str | Path | None) -> str:
+    """What a card calls the shapes trained on; `config.label` names those tested on."""
+    match config.name:
+        case "folder":
+            return f"folder {config.folder}"
+        case "icl_nuim" if root is not None:
+            place = icl_nuim.find_file(root, "train").parent.parent
+            return "icl_nuim" if place == Path(root) else place.name
+    found = dataset_label(dataclasses.replace(config, label=""), root)
+    if config.name == "modelnet40":
+        return f"{found}, training shapes: {config.train_categories}"
+    return found
 
 
 def shape_points(pairs: PairConfig) -> int:

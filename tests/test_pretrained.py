@@ -45,3 +45,19 @@ def test_released_weights_are_small_and_tell_where_they_come_from(name):
     variables, config = pretrained.load_pretrained(name)
     fresh = init_variables(jax.random.key(0), config.model)
     assert jax.tree.map(np.shape, fresh) == jax.tree.map(np.shape, variables)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../modelnet40", "a b", "a.b", "möbel", "a\n"])
+def test_a_name_that_is_not_plain_is_refused(name):
+    with pytest.raises(ValueError, match="use letters, digits, _ and - only"):
+        pretrained.check_new_name(name)
+
+
+def test_a_name_that_is_taken_is_refused_until_its_files_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr(pretrained.resources, "files", lambda package: tmp_path)
+    pretrained.check_new_name("my_scans-2")
+    pretrained.save_weights(tmp_path / "weights", "my_scans-2", {"a": np.zeros(1)}, Config(), {})
+    with pytest.raises(ValueError, match=r"delete my_scans-2.npz and my_scans-2.json in .*weights"):
+        pretrained.check_new_name("my_scans-2")
+    (tmp_path / "weights" / "my_scans-2.npz").unlink()
+    pretrained.check_new_name("my_scans-2")

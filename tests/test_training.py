@@ -1,16 +1,22 @@
 """Training: unsupervised, resumable bit for bit, and stopped by a loss that is not finite."""
 
 import dataclasses
+import errno
 import functools
 import json
+import shlex
+import shutil
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import train as script
 from jaxreg import checkpoint, training
-from jaxreg.config import Config, from_dict
+from jaxreg.config import Config, DataConfig, TrainConfig, from_dict
 from jaxreg.types import RigidTransform
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -163,3 +169,272 @@ def test_a_checkpoint_with_other_arrays_is_an_error_that_says_so(config, tmp_pat
         run.save(1, {"weights": jnp.zeros(3)}, error=1.0)
     with pytest.raises(ValueError, match="other arrays than this version"):
         training.load_checkpoint(tmp_path)
+
+
+def entries(workdir) -> list[dict]:
+    lines = (workdir / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def other(config: Config) -> Config:
+    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, beta=0.5))
+
+
+def test_a_run_stopped_before_its_first_checkpoint_starts_anew(config, tmp_path):
+    start = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.log({"step": 1, "loss": 3.0})
+        run.log({"step": 2, "loss": 2.0})
+    with (tmp_path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"step": 3, "lo')  # Killed while it wrote.
+    with checkpoint.open_run(tmp_path, other(config)) as run:
+        assert run.restore(start) is start
+        run.log({"step": 1, "loss": 4.0})
+    assert entries(tmp_path) == [{"step": 1, "loss": 4.0}]
+
+
+def test_a_log_that_an_earlier_version_left_in_pieces_is_mended(config, tmp_path):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(2, state, error=1.0)
+    pieces = ['{"step": 1}', '{"step": 2, "lo{"step": 1}', "[2]", "\udcff", '{"step": 2}', '{"st']
+    text = "\n".join(pieces)
+    (tmp_path / "metrics.jsonl").write_text(text, encoding="utf-8", errors="surrogateescape")
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.restore(state)
+    assert entries(tmp_path) == [{"step": 1}, {"step": 2}]
+
+
+def test_a_log_is_whole_even_where_the_run_is_killed_while_it_mends_it(
+    config, tmp_path, monkeypatch
+):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(1, state, error=1.0)
+        run.log({"step": 1})
+        run.log({"step": 2})
+
+    def killed(path, target):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, checkpoint.open_run(tmp_path, config) as run:
+        patched.setattr(type(tmp_path), "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run.restore(state)
+    assert entries(tmp_path) == [{"step": 1}, {"step": 2}]
+
+
+def test_killed_in_its_first_save_a_run_keeps_its_configuration(config, tmp_path):
+    state = {"weights": jnp.zeros(3)}
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(1, state, error=1.0)
+    shutil.rmtree(tmp_path / "latest")  # The best state is there, the newest was not finished.
+    with (
+        checkpoint.open_run(tmp_path, other(config)) as run,
+        pytest.raises(ValueError, match=r"loss.beta: 0.01 there, 0.5 here"),
+    ):
+        run.restore(state)
+    with checkpoint.open_run(tmp_path, config) as run:
+        assert run.restore(state) is state
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize(
+    ("name", "value", "bound"),
+    [
+        ("steps", 0, "at least 1"),
+        ("batch", 0, "at least 1"),
+        ("validate_every", 0, "at least 1"),
+        ("validation_pairs", -1, "at least 1"),
+        ("warmup", -1, "at least 0"),
+        ("seed", -1, "at least 0"),
+        ("learning_rate", 0.0, "positive"),
+        ("learning_rate", float("nan"), "positive"),
+        ("final_learning_rate", -1e-5, "at least 0"),
+        ("weight_decay", float("inf"), "at least 0 and finite"),
+        ("clip", 0.0, "positive"),
+        ("ema", 1.5, "at least 0 and at most 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_before_the_work(
+    config, tmp_path, name, value, bound
+):
+    wrong = dataclasses.replace(config, train=dataclasses.replace(config.train, **{name: value}))
+    option = f"--train.{name.replace('_', '-')}"
+    with pytest.raises(ValueError, match=rf"train.{name} must be {bound}.*, got {value}.*{option}"):
+        training.train(wrong, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_settings_at_the_end_of_their_range_are_taken():
+    training._check_options(
+        TrainConfig(
+            steps=1, batch=1, validate_every=1, validation_pairs=1, warmup=0, weight_decay=0.0,
+            final_learning_rate=0.0, clip=float("inf"), ema=1.0, seed=0,
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("inside", ["", "runs/own"])
+def test_a_workdir_that_is_a_file_is_refused_before_the_work(config, tmp_path, inside, monkeypatch):
+    monkeypatch.setattr(training, "load_shapes", None)  # Reading the data would fail.
+    (tmp_path / "README.md").write_text("text")
+    with pytest.raises(ValueError, match="README.md is a file: name a directory by --workdir"):
+        training.train(config, tmp_path / "README.md" / inside)
+
+
+def test_a_run_of_another_optimiser_is_evaluated_and_only_read(config, tmp_path):
+    state = training.create_train_state(config)
+    changed = state._replace(optimizer={"momentum": jnp.zeros(7)})
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, changed, error=1.0)
+    shutil.rmtree(tmp_path / "latest")
+    files = sorted(tmp_path.rglob("*"))
+    variables, saved = training.load_checkpoint(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, variables, state.average)
+    assert saved == config
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_a_run_of_another_optimiser_is_not_resumed(config, tmp_path):
+    state = training.create_train_state(config)
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, state._replace(optimizer={"momentum": jnp.zeros(7)}), error=1.0)
+    message = r"other arrays than this version .*\(optimizer/.* there, .* here\)"
+    with (
+        checkpoint.open_run(tmp_path, config) as run,
+        pytest.raises(ValueError, match=message),
+    ):
+        run.restore(state)
+
+
+def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(3, training.create_train_state(config), error=1.0)
+    for path in (tmp_path / "best" / "3" / "state").rglob("*"):
+        if path.is_file() and "METADATA" not in path.name:
+            path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"best cannot be read \(.*\): put a whole copy"):
+        training.load_checkpoint(tmp_path)
+
+
+@pytest.fixture
+def released(monkeypatch) -> list:
+    """What `release` would write into the package."""
+    written = []
+    monkeypatch.setattr(training, "save_weights", lambda *arguments: written.append(arguments))
+    return written
+
+
+def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path, released):
+    data = dataclasses.replace(config.data, label="what is tested on")
+    config = dataclasses.replace(config, data=data)
+    state = training.create_train_state(config)
+    with checkpoint.open_run(tmp_path, config) as run:
+        for step, error in ((2, 5.0), (4, 9.0)):
+            run.save(step, state._replace(step=jnp.int32(step)), error)
+            run.log({"step": step - 1, "loss": 0.5})
+            run.log({"step": step, "loss": 0.5, "val_mie_r_deg": error, "val_mae_t": 1.0})
+    training.release("mine", tmp_path, "python train.py 'a b'")
+    ((_, name, variables, saved, card),) = released
+    assert (name, saved) == ("mine", config)
+    jax.tree.map(np.testing.assert_array_equal, variables, state.average)
+    assert card == {
+        "command": "python train.py 'a b'",
+        "data": "shapes",
+        "seed": 0,
+        "step": 2,
+        "validation": {"mie_r_deg": 5.0, "mae_t": 1.0},
+    }
+
+
+def test_a_log_without_the_best_step_is_an_error_that_says_so(config, tmp_path, released):
+    state = training.create_train_state(config)._replace(step=jnp.int32(2))
+    with checkpoint.open_run(tmp_path, config) as run:
+        run.save(2, state, error=1.0)
+        run.log({"step": 1, "loss": 0.5})
+    with pytest.raises(ValueError, match=r"metrics.jsonl lacks step 2.* finish"):
+        training.release("mine", tmp_path, "")
+    with pytest.raises(ValueError, match="there are weights 'modelnet40' already"):
+        training.release("modelnet40", tmp_path, "")
+    assert not released
+
+
+def test_the_data_of_a_card_is_what_was_trained_on(tmp_path):
+    (tmp_path / "ours" / "train").mkdir(parents=True)
+    (tmp_path / "ours" / "train" / "icl_nuim.h5").touch()
+    (tmp_path / "theirs" / "test").mkdir(parents=True)
+    (tmp_path / "theirs" / "test" / "icl_nuim.h5").touch()
+    called = {
+        "ours": DataConfig(name="icl_nuim", label="test"),
+        "modelnet40, training shapes: first20": DataConfig(train_categories="first20"),
+        "folder my_scans": DataConfig(name="folder", folder="my_scans"),
+    }
+    for name, data in called.items():
+        assert training._training_data(data, tmp_path) == name
+
+
+@pytest.fixture
+def run_script(tmp_path, monkeypatch, capsys):
+    """Runs train.py in this process; returns its status and its messages. Training is replaced."""
+    toml = tmp_path / "c.toml"
+    toml.write_text('[data]\nname = "shapes"\n')
+
+    def run(*arguments, train=lambda config, workdir, *, root: None):
+        with monkeypatch.context() as patched:
+            patched.setattr(sys, "argv", ["train.py", str(toml), *map(str, arguments)])
+            patched.setattr(script, "enable_compilation_cache", lambda: None)
+            patched.setattr(script, "train", train)
+            try:
+                script.main()
+            except SystemExit as end:
+                return end.code, capsys.readouterr().err
+        return 0, capsys.readouterr().err
+
+    return run
+
+
+def one_step(config, workdir, *, root):
+    Path(workdir).mkdir(exist_ok=True)
+    (Path(workdir) / "metrics.jsonl").write_text('{"step": 1, "loss": 1.0}\n')
+
+
+def test_a_card_gets_the_command_as_it_was_typed(run_script, tmp_path, monkeypatch):
+    released = []
+    monkeypatch.setattr(
+        script, "release", lambda name, workdir, command, *, root: released.append((name, command))
+    )
+    typed = ["--workdir", str(tmp_path / "a run"), "--train.steps", "7", "--release", "mine"]
+    assert run_script(*typed, train=one_step) == (0, "")
+    ((name, command),) = released
+    assert name == "mine"
+    assert shlex.split(command) == ["python", "train.py", str(tmp_path / "c.toml"), *typed]
+
+
+def test_weights_are_not_replaced_and_that_is_said_before_the_training(run_script):
+    status, message = run_script("--release", "modelnet40", train=None)
+    assert status == 2
+    assert message.startswith("error: there are weights 'modelnet40' already")
+
+
+def test_after_the_training_an_error_is_one_line_and_loses_nothing(run_script, tmp_path):
+    (tmp_path / "curves.png").mkdir()
+    status, message = run_script("--workdir", tmp_path, train=one_step)
+    assert status == 2
+    assert message.startswith(f"error: {tmp_path}/curves.png: Is a directory")
+    assert f"({tmp_path} holds the whole run: the same command does the rest)" in message
+    assert len(message.splitlines()) == 1
+
+
+def test_an_error_of_the_file_system_is_one_line_and_status_2(run_script):
+    def full(config, workdir, *, root):
+        raise OSError(errno.ENOSPC, "No space left on device", "runs/c/latest")
+
+    expected = "error: runs/c/latest: No space left on device\n"
+    assert run_script(train=full) == (2, expected)
+
+
+def test_a_workdir_that_is_a_file_is_one_line_and_status_2(run_script, tmp_path):
+    status, message = run_script("--workdir", tmp_path / "c.toml", train=training.train)
+    assert (status, len(message.splitlines())) == (2, 1)
+    assert message.startswith(f"error: {tmp_path}/c.toml is a file")
