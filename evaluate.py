@@ -1,11 +1,14 @@
 """Evaluate: `python evaluate.py CONFIG.toml [--checkpoint DIR | --method NAME | --transforms FILE]`.
 
 Without any of them the released weights that the configuration (or --weights) names are evaluated.
-Every method meets the same pairs and the same metrics, in float64 from transforms.
+Every method meets the same pairs and the same metrics, in float64 from transforms. The pairs are those
+of [data] and [test_pairs]; a network keeps all that it was trained with but its iterations, n_inliers
+and robust_rounds. An option that would change nothing is refused.
 """
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,16 +22,18 @@ from jaxreg.data import data_root
 from jaxreg.options import parse, stop
 from jaxreg.report import results_table
 
-_CHOICE = (
-    "checkpoint",
-    "predecessor",
-    "method",
-    "transforms",
-    "refine",
-    "pairs",
-    "batch",
-    "save_transforms",
-)
+_METHODS = ("checkpoint", "predecessor", "method", "transforms")
+_CHOICE = (*_METHODS, "refine", "pairs", "batch")
+_SUFFIXES = {
+    "json": (),
+    "save_transforms": (".npz",),
+    "save_pairs": (".npz",),
+    "picture": (".png", ".pdf", ".svg"),
+}
+"""The options that name an output, and how its name must end."""
+_WITHOUT_ROOT = ("shapes", "folder")
+"""Sources that read nothing from the folder of the data sets."""
+_TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +42,8 @@ class Options:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     checkpoint: str = ""
-    """Working directory of a run of train.py; its best checkpoint is evaluated."""
+    """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations,
+    n_inliers and robust_rounds of the run unless the command line gives others."""
     predecessor: str = ""
     """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
     method: str = ""
@@ -53,7 +59,7 @@ class Options:
     json: str = ""
     """Write the figures to this file."""
     picture: str = ""
-    """Draw the first pair before and after to this PNG file."""
+    """Draw the first pair before and after, as it was evaluated, to this file (PNG, PDF or SVG)."""
     save_pairs: str = ""
     """Write the pairs to this NPZ file, for --transforms by another program."""
     save_transforms: str = ""
@@ -62,51 +68,141 @@ class Options:
     """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
 
 
-def _check(options: Options) -> None:
+def main(arguments: list[str] | None = None) -> None:
+    """Parse, evaluate, print, write."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    path, options = parse(Options, description=__doc__, arguments=arguments)
+    enable_compilation_cache()
+    try:
+        _check(options, path)
+        config = _evaluated_config(options, path, _given(arguments[1:]))
+        root = None if config.data.name in _WITHOUT_ROOT else data_root(options.data_root, path)
+        chosen = {name: getattr(options, name) for name in _CHOICE}
+        scored = scoring.evaluate(config, root=root, **chosen)
+        # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
+        try:
+            _report(options, path, scored)
+        finally:
+            _write(options, config, root, scored)
+    except ValueError as error:
+        stop(str(error))
+    except OSError as error:
+        stop(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except KeyboardInterrupt:
+        stop("interrupted", status=130)
+
+
+def _check(options: Options, path: Path) -> None:
     """What cannot be done is said before the work, not after it."""
     if options.pairs < 0 or options.batch < 1:
         raise ValueError(
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
             "--batch 1 or more."
         )
-    for path in (options.json, options.picture, options.save_pairs, options.save_transforms):
-        if path:
-            io.check_folder(Path(path))
+    taken = [path, *(Path(p) for p in (options.transforms, options.predecessor) if p)]
+    for name, suffixes in _SUFFIXES.items():
+        if getattr(options, name):
+            output = Path(getattr(options, name))
+            if suffixes and output.suffix.lower() not in suffixes:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} {output}: name a file that ends in "
+                    f"{' or '.join(suffixes)}."
+                )
+            _check_place(output, taken)
+            taken.append(output)
 
 
-def main() -> None:
-    """Parse, evaluate, print."""
-    path, options = parse(Options, description=__doc__)
-    enable_compilation_cache()
-    chosen = {name: getattr(options, name) for name in _CHOICE}
-    try:
-        _check(options)
-        root = data_root(options.data_root, path)
-        result = scoring.score(options.config, root=root, **chosen)
-        _write_extras(options, root)
-    except ValueError as error:
-        stop(str(error))
-    except KeyboardInterrupt:
-        stop("interrupted", status=130)
-    result["config"] = path.stem
+def _check_place(path: Path, taken: list[Path]) -> None:
+    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
+    io.check_folder(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory: name a file in it.")
+    if path.resolve() in [other.resolve() for other in taken]:
+        raise ValueError(f"{path} is read or written by this command already: choose another name.")
+
+
+def _given(arguments: list[str]) -> dict[str, str]:
+    """The options of a command line, by the field that they set (`model.n_inliers`)."""
+    options = [word.partition("=")[0] for word in arguments if word.startswith("--")]
+    return {option[2:].replace("-", "_"): option for option in options}
+
+
+def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Config:
+    """The configuration to evaluate with, after a word on what differs from the file at `path`.
+
+    What the file says of a network is what train.py starts from; a run may have been made with other
+    options, and its network is evaluated as it was trained. Released weights follow the file.
+
+    Raises:
+      ValueError: an option of the command line changes nothing; says what to give instead.
+    """
+    for name, option in given.items():
+        if reason := _no_effect(name, option, options):
+            raise ValueError(f"{option} changes nothing here: {reason}.")
+    config = options.config
+    if not options.checkpoint:
+        return config
+    model = dataclasses.asdict(scoring.trained_config(config, checkpoint=options.checkpoint).model)
+    changed = {}
+    for name in scoring.AFTER_TRAINING:
+        value = getattr(config.model, name)
+        if f"model.{name}" not in given and model[name] != value:
+            changed[name] = model[name]
+            print(
+                f"model.{name} = {model[name]} as {options.checkpoint} was trained, not {value} as "
+                f"in {path} (to have that: --model.{name.replace('_', '-')} {value})"
+            )
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changed))
+
+
+def _no_effect(name: str, option: str, options: Options) -> str:
+    """Why an option has no effect on an evaluation, and what to do; empty if it has one."""
+    config, (section, _, field) = options.config, name.partition(".")
+    chosen = next((f"--{method}" for method in _METHODS if getattr(options, method)), "")
+    if name == "weights" and chosen:
+        return f"{chosen} says what is evaluated; leave out one of the two"
+    if not field:
+        return ""
+    if section == "pairs":
+        value = getattr(config.pairs, field, True)
+        text = "" if isinstance(value, bool) else f" {value}"  # A switch has no value.
+        return f"[pairs] are to train on; to test on such pairs give --test-{option[2:]}{text}"
+    if section in ("loss", "train") or (section == "data" and field in _TRAINING_DATA):
+        return "it belongs to the training; give it to train.py, or leave it out"
+    if section != "model":
+        return ""
+    if chosen in ("--method", "--transforms"):
+        return f"{chosen} evaluates no network; leave it out"
+    if field in scoring.AFTER_TRAINING or not (chosen or config.weights):
+        return ""
+    field = field.removeprefix("no_")
+    trained = scoring.trained_config(
+        config, checkpoint=options.checkpoint, predecessor=options.predecessor
+    )
+    value = getattr(trained.model, field)
+    if value == getattr(config.model, field):
+        return ""
+    return (
+        f"the weights were trained with {field} = {value}; leave it out, or give it to train.py and "
+        "evaluate that run by --checkpoint"
+    )
+
+
+def _report(options: Options, path: Path, scored: scoring.Scored) -> None:
+    result = scoring.figures(scored) | {"config": path.stem}
     Console().print(results_table([result], title=str(path)))
     if options.json:
         Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def _write_extras(options: Options, root: Path | None) -> None:
+def _write(options: Options, config: Config, root: Path | None, scored: scoring.Scored) -> None:
+    if options.save_transforms:
+        scoring.save_transforms(options.save_transforms, scored.predicted)
     if options.save_pairs:
-        _, batches = scoring.pair_stream(options.config, root=root, pairs=options.pairs)
+        _, batches = scoring.pair_stream(config, root=root, pairs=options.pairs)
         scoring.save_pairs(options.save_pairs, batches)
     if options.picture:
-        scoring.draw_first_pair(
-            options.picture,
-            options.config,
-            root=root,
-            checkpoint=options.checkpoint,
-            predecessor=options.predecessor,
-            method=options.method,
-        )
+        scoring.draw_first_pair(options.picture, scored)
 
 
 if __name__ == "__main__":

@@ -324,7 +324,7 @@ class Config:
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
     pairs: PairConfig = PairConfig()
-    """Pairs to train and to test on."""
+    """Pairs to train on; and to test on, where a file has no `[test_pairs]`."""
     test_pairs: PairConfig = PairConfig()
     """Pairs to test on. A file's `[test_pairs]` starts from its `[pairs]` and states what differs."""
     data: DataConfig = DataConfig()

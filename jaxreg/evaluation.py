@@ -4,6 +4,8 @@ A method is a function of a batch of pairs (a `Pair` with a leading axis on ever
 stacked transforms from source to reference; it must not read `Pair.transform`.
 """
 
+import dataclasses
+import inspect
 import time
 from collections.abc import Callable, Iterator
 
@@ -187,19 +189,11 @@ def refined_method(method: Method, refine: Refinement) -> Method:
 
 
 def refinement(config: RefineConfig) -> Refinement:
-    """The ICP family from given poses of a batch."""
-    options = {
-        name: getattr(config, name)
-        for name in ("iterations", "max_distance", "trim", "kernel", "anneal", "both_directions")
-    }
-    match config.method:
-        case "icp":
-            refine = icp
-        case "point_to_plane":
-            refine, options = point_to_plane, options | {"neighbors": config.neighbors}
-        case "gicp":
-            own = {"neighbors": config.neighbors, "thickness": config.thickness}
-            refine, options = gicp, options | own
+    """The ICP family from given poses of a batch; each gets the fields of `config` it takes."""
+    refine = {"icp": icp, "point_to_plane": point_to_plane, "gicp": gicp}[config.method]
+    taken = inspect.signature(refine).parameters
+    names = [field.name for field in dataclasses.fields(config) if field.name in taken]
+    options = {name: getattr(config, name) for name in names}
 
     def one(source, reference, initial):
         masks = {"source_mask": source.mask, "reference_mask": reference.mask}

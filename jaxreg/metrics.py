@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg.types import RigidTransform
@@ -128,25 +127,6 @@ def rotation_angle_deg_float32_acos(
     relative = np.swapaxes(other.astype(np.float32), -1, -2) @ rotation.astype(np.float32)
     cosine = (np.trace(relative, axis1=-2, axis2=-1) - np.float32(1)) / np.float32(2)
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def chamfer_distance(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"]) -> float:
-    """``mean_i min_j |x_i - y_j|^2 + mean_j min_i |x_i - y_j|^2``, in squared units.
-
-    Raises:
-      ValueError: a cloud is not (n, 3) with n >= 1, or not finite.
-    """
-    clouds = []
-    for name, cloud in (("first", points), ("second", others)):
-        cloud = np.asarray(cloud, np.float64)
-        if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud):
-            raise ValueError(f"the {name} cloud must be (n, 3) with n >= 1, got {cloud.shape}.")
-        if not np.isfinite(cloud).all():
-            row = int(np.argmin(np.isfinite(cloud).all(axis=1)))
-            raise ValueError(f"point {row} of the {name} cloud is not finite: drop such points.")
-        clouds.append(cloud)
-    forward, backward = (cKDTree(b).query(a)[0] for a, b in (clouds, clouds[::-1]))
-    return float(np.mean(forward**2) + np.mean(backward**2))
 
 
 def _checked(transform: RigidTransform, name: str) -> RigidTransform:

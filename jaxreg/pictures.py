@@ -41,7 +41,7 @@ def plot_pair(
     confidence: Float[np.ndarray, "n"] | None = None,
     title: str = "",
 ) -> None:
-    """Draw a pair before and after registration, from two sides, as PNG.
+    """Draw a pair before and after registration, from two sides (PNG, PDF or SVG, by the suffix).
 
     Source blue, reference yellow, aligned source green; far points are paler. All panels have one
     scale, and the reference stays in its place. With `truth` the title states the errors, without

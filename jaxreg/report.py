@@ -1,4 +1,4 @@
-"""What people see of results: tables, the progress of a training run, pictures."""
+"""What people see of a run: tables of results, and its progress with and without a terminal."""
 
 import contextlib
 import time
@@ -14,10 +14,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
-
-from jaxreg.pictures import plot_curves, plot_pair
-
-__all__ = ["plot_curves", "plot_pair", "print_results", "results_table", "training_progress"]
 
 Result = Mapping[str, float | str | None]
 """What `evaluate.py` writes: the metrics of `jaxreg.metrics.summarize` and the method's name."""
@@ -60,13 +56,6 @@ def results_table(results: Sequence[Result], *, title: str | None = None) -> Tab
     for label, row in zip(labels, cells, strict=True):
         table.add_row(label, *row)
     return table
-
-
-def print_results(
-    results: Sequence[Result], *, title: str | None = None, console: Console | None = None
-) -> None:
-    """Print the table of `results`."""
-    (console or Console()).print(results_table(results, title=title))
 
 
 def _cell(result: Result, name: str) -> str:

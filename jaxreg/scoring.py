@@ -7,21 +7,35 @@ metrics.
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxreg import checkpoint as checkpoints
 from jaxreg import classical, evaluation, metrics, report
 from jaxreg.config import Config, RefineConfig
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
-from jaxreg.predecessor import load_predecessor
+from jaxreg.pictures import plot_pair
+from jaxreg.predecessor import load_predecessor, read_arrays
 from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.training import load_checkpoint, shape_points
 from jaxreg.types import Pair, RigidTransform
 
 _REFINEMENTS = ("icp", "point_to_plane", "gicp")
-_AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
+AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
+"""Fields of the model that cost nothing to change after training."""
+
+
+class Scored(NamedTuple):
+    """What `evaluate` finds (numpy): stacked transforms, the first pair, and how they were made."""
+
+    method: str
+    dataset: str
+    predicted: RigidTransform
+    truth: RigidTransform
+    first: Pair
+    seconds: float | None
 
 
 def choose_method(name: str) -> evaluation.Method:
@@ -38,19 +52,28 @@ def choose_method(name: str) -> evaluation.Method:
     return evaluation.host_method(classical.choose(name))
 
 
-def _network(config: Config, checkpoint: str, predecessor: str) -> tuple[str, evaluation.Method]:
-    """A trained network with the architecture it was trained with.
+def trained_config(config: Config, *, checkpoint: str = "", predecessor: str = "") -> Config:
+    """The configuration that a network was trained with, chosen as by `evaluate`.
 
-    What costs nothing to change after training follows `config`: the iterations, N_c and the
-    robust rounds of the Procrustes.
+    Raises:
+      ValueError: there is no such checkpoint, file, or name of released weights.
     """
+    if predecessor:
+        return load_predecessor(predecessor)[1]
+    if checkpoint:
+        return checkpoints.best_config(checkpoint)[0]
+    return load_pretrained(config.weights)[1]
+
+
+def _network(config: Config, checkpoint: str, predecessor: str) -> tuple[str, evaluation.Method]:
+    """A trained network with the architecture it was trained with; `AFTER_TRAINING` as in `config`."""
     if predecessor:
         label, (variables, trained) = "predecessor", load_predecessor(predecessor)
     elif checkpoint:
         label, (variables, trained) = f"checkpoint {checkpoint}", load_checkpoint(checkpoint)
     else:
         label, (variables, trained) = f"jaxreg ({config.weights})", load_pretrained(config.weights)
-    chosen = {name: getattr(config.model, name) for name in _AFTER_TRAINING}
+    chosen = {name: getattr(config.model, name) for name in AFTER_TRAINING}
     model = dataclasses.replace(trained.model, **chosen)
     return label, evaluation.network_method(variables, model)
 
@@ -92,7 +115,7 @@ def _file_pairs(config: Config, root: str | Path | None, pairs: int) -> tuple[np
     return tuple(array[: pairs or None] for array in icl_nuim.load_pairs(root))
 
 
-def score(
+def evaluate(
     config: Config,
     *,
     root: str | Path | None = None,
@@ -103,9 +126,8 @@ def score(
     refine: str = "",
     pairs: int = 0,
     batch: int = 8,
-    save_transforms: str = "",
-) -> dict[str, Any]:
-    """Evaluate one method on the test pairs of `config`; returns the figures, in degrees.
+) -> Scored:
+    """Evaluate one method on the test pairs of `config`.
 
     One of `checkpoint`, `predecessor` (its weights file), `method` and `transforms` chooses it; with
     none of them it is the released weights that `config` names. `refine` (icp, point_to_plane or
@@ -125,6 +147,8 @@ def score(
         )
     improve = _refinement(refine)
     count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
+    first: list[Pair] = []
+    batches = _keep_first(batches, first)
     given = _read_transforms(transforms, count) if transforms else None
     if given is not None and not refine:
         predicted, seconds = given, None
@@ -144,11 +168,39 @@ def score(
             predicted, truth, seconds = evaluation.evaluate_method(
                 function, batches, progress, initial=given
             )
+    return Scored(label, dataset_label(config.data, root), predicted, truth, first[0], seconds)
+
+
+def figures(scored: Scored) -> dict[str, Any]:
+    """The metrics of an evaluation (`jaxreg.metrics.summarize`, degrees), and what it was of.
+
+    Raises:
+      ValueError: a predicted transform is not finite or no rotation.
+    """
+    found = metrics.evaluate_transforms(scored.predicted, scored.truth)
+    named = {"method": scored.method, "dataset": scored.dataset}
+    return named | found | {"seconds_per_pair": scored.seconds}
+
+
+def score(config: Config, *, save_transforms: str = "", **chosen: Any) -> dict[str, Any]:
+    """The figures of `evaluate`, whose arguments these are; errors as those of both.
+
+    `save_transforms` names an NPZ file for the predicted transforms.
+    """
+    scored = evaluate(config, **chosen)
     if save_transforms:
-        np.savez(save_transforms, **predicted._asdict())
-    figures = metrics.evaluate_transforms(predicted, truth)
-    dataset = dataset_label(config.data, root)
-    return {"method": label, "dataset": dataset} | figures | {"seconds_per_pair": seconds}
+        _save(save_transforms, scored.predicted._asdict())
+    return figures(scored)
+
+
+def _keep_first(
+    batches: Iterator[tuple[Pair, int]], first: list[Pair]
+) -> Iterator[tuple[Pair, int]]:
+    """The same batches; the first pair of all is put into `first`, to be drawn as it was evaluated."""
+    for pair, count in batches:
+        if not first:
+            first.append(jax.tree.map(lambda x: np.asarray(x)[0].copy(), pair))
+        yield pair, count
 
 
 def _refinement(name: str) -> evaluation.Refinement | None:
@@ -162,13 +214,12 @@ def _refinement(name: str) -> evaluation.Refinement | None:
 
 
 def _read_transforms(path: str, count: int) -> RigidTransform:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            transform = RigidTransform(arrays["rotation"], arrays["translation"])
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path} must be an NPZ file with `rotation` (n, 3, 3) and `translation` (n, 3): {error}."
-        ) from None
+    remedy = "give an NPZ file with numbers `rotation` (n, 3, 3) and `translation` (n, 3)"
+    arrays = read_arrays(path, ("rotation", "translation"), remedy=remedy)
+    transform = RigidTransform(arrays["rotation"], arrays["translation"])
+    for name, array in transform._asdict().items():
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"{path}: `{name}` is of type {array.dtype}: {remedy}.")
     if transform.rotation.shape != (count, 3, 3) or transform.translation.shape != (count, 3):
         raise ValueError(
             f"{path}: {count} pairs need rotation ({count}, 3, 3) and translation ({count}, 3), got "
@@ -177,38 +228,34 @@ def _read_transforms(path: str, count: int) -> RigidTransform:
     return transform
 
 
-def save_pairs(path: str, batches: Iterator[tuple[Pair, int]]) -> None:
+def save_pairs(path: str | Path, batches: Iterator[tuple[Pair, int]]) -> None:
     """Write pairs to an NPZ file: `source`, `reference` (n, p, 3) and their masks (n, p)."""
     parts = [jax.tree.map(lambda x, c=count: np.asarray(x)[:c], pair) for pair, count in batches]
     pair = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    np.savez(
-        path,
-        source=pair.source.points,
-        source_mask=pair.source.mask,
-        reference=pair.reference.points,
-        reference_mask=pair.reference.mask,
-    )
+    arrays = {
+        "source": pair.source.points,
+        "source_mask": pair.source.mask,
+        "reference": pair.reference.points,
+        "reference_mask": pair.reference.mask,
+    }
+    _save(path, arrays)
 
 
-def draw_first_pair(
-    path: str,
-    config: Config,
-    *,
-    root: str | Path | None = None,
-    checkpoint: str = "",
-    predecessor: str = "",
-    method: str = "",
-) -> None:
-    """Draw the first test pair before and after registration as PNG."""
-    _, batches = pair_stream(config, root=root, pairs=1, batch=1)
-    pair, _ = next(batches)
-    if method:
-        function = choose_method(method)
-    else:
-        _, function = _network(config, checkpoint, predecessor)
-    predicted = function(pair)
-    first = jax.tree.map(lambda x: np.asarray(x)[0], (pair, predicted))
-    (source, reference, truth), transform = first
-    report.plot_pair(
+def save_transforms(path: str | Path, transforms: RigidTransform) -> None:
+    """Write stacked transforms to an NPZ file: `rotation` (n, 3, 3) and `translation` (n, 3)."""
+    _save(path, transforms._asdict())
+
+
+def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+    # Opened here: to a name without .npz numpy would add it.
+    with Path(path).open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def draw_first_pair(path: str | Path, scored: Scored) -> None:
+    """Draw the first pair of an evaluation before and after, in the pose that was evaluated."""
+    source, reference, truth = scored.first
+    transform = jax.tree.map(lambda x: np.asarray(x)[0], scored.predicted)
+    plot_pair(
         source.points[source.mask], reference.points[reference.mask], transform, path, truth=truth
     )

@@ -1,5 +1,8 @@
 """Evaluation: pairs do not depend on the batch, and the last batch is cut, not padded into means."""
 
+import dataclasses
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -141,6 +144,36 @@ def test_a_refinement_mends_poses_that_are_nearly_right(method, seed):
         predicted, truth, _ = evaluation.evaluate_method(function, iter(stream))
         error = np.abs(predicted.translation - truth.translation).max()
         assert lowest <= error <= highest
+
+
+@pytest.mark.parametrize(
+    ("method", "others"),
+    [
+        ("icp", {"neighbors", "thickness", "edges"}),
+        ("point_to_plane", {"thickness", "edges"}),
+        ("gicp", set()),
+    ],
+)
+def test_a_refinement_is_given_all_that_its_configuration_says(method, others, shapes, monkeypatch):
+    of_the_host = {"method", "weak_threshold", "dense_limit", "tolerance"}
+    config = RefineConfig(
+        method, iterations=7, max_distance=3.0, trim=0.5, kernel="huber", anneal=2.0
+    )
+    config = dataclasses.replace(config, both_directions=True, neighbors=4, thickness=0.5)
+    seen = {}
+
+    @functools.wraps(getattr(evaluation, method))
+    def recorded(source, reference, *, initial, source_mask, reference_mask, **options):
+        seen.update(options)
+        return initial
+
+    monkeypatch.setattr(evaluation, method, recorded)
+    pair, _ = next(batches(shapes, 5))
+    evaluation.refinement(config)(pair, pair.transform)
+    expected = {
+        k: v for k, v in dataclasses.asdict(config).items() if k not in of_the_host | others
+    }
+    assert seen == expected
 
 
 def test_given_pairs_keep_their_pose_and_are_cropped(seed):

@@ -3,10 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from jaxreg.metrics import chamfer_distance, evaluate_transforms, pair_errors
+from jaxreg.metrics import evaluate_transforms, pair_errors
 from jaxreg.types import RigidTransform
 
 
@@ -140,27 +139,3 @@ def test_what_is_no_rigid_transform_is_refused(pair, change, message):
     predicted, truth, _ = pair
     with pytest.raises(ValueError, match=message):
         evaluate_transforms(change(predicted), truth)
-
-
-def test_chamfer_distance_equals_the_full_matrix_of_distances(seed):
-    rng = np.random.default_rng(seed)
-    x, y = rng.normal(size=(40, 3)), rng.normal(size=(70, 3))
-    squared = cdist(x, y, "sqeuclidean")
-    expected = squared.min(axis=1).mean() + squared.min(axis=0).mean()
-    assert chamfer_distance(x, y) == pytest.approx(expected)
-    assert chamfer_distance(y, x) == pytest.approx(expected)
-    assert chamfer_distance(x, x[::-1]) == 0
-
-
-@pytest.mark.untyped
-@pytest.mark.parametrize(
-    ("cloud", "message"),
-    [
-        (np.zeros((0, 3)), "first cloud must be"),
-        (np.zeros((4, 2)), r"got \(4, 2\)"),
-        (np.array([[0, 0, 0], [0, np.nan, 0]]), "point 1 of the first cloud is not finite"),
-    ],
-)
-def test_chamfer_distance_refuses(cloud, message):
-    with pytest.raises(ValueError, match=message):
-        chamfer_distance(cloud, np.zeros((2, 3)))

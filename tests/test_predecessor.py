@@ -15,7 +15,7 @@ import pytest
 from jaxreg.losses import step_losses
 from jaxreg.matching import feature_distance, matching_scores
 from jaxreg.model import init_variables, iterate, neighborhood_graph, point_features
-from jaxreg.predecessor import load_predecessor
+from jaxreg.predecessor import load_predecessor, read_arrays
 from jaxreg.types import PointCloud
 
 # In float64, so that only their rounding is seen; Flax promotes with the float32 that it starts from.
@@ -161,3 +161,20 @@ def test_what_is_no_weight_file_is_named(tmp_path):
         load_predecessor(text)
     with pytest.raises(ValueError, match=r"other\.npz has no array 'emb_nn"):
         load_predecessor(other)
+
+
+def test_whatever_is_no_archive_of_arrays_is_refused_by_name_and_with_the_remedy(tmp_path):
+    np.savez(tmp_path / "whole.npz", a=np.arange(1000.0), b=np.zeros(3))
+    np.testing.assert_array_equal(read_arrays(tmp_path / "whole.npz", remedy="x")["b"], np.zeros(3))
+    whole = (tmp_path / "whole.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "damaged.npz").write_bytes(whole[:500] + bytes(100) + whole[600:])
+    (tmp_path / "empty.npz").touch()
+    (tmp_path / "folder.npz").mkdir()
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    np.savez(tmp_path / "objects.npz", a=np.array([None]))
+    for name in ("cut.npz", "damaged.npz", "empty.npz", "folder.npz", "one.npy", "objects.npz"):
+        with pytest.raises(ValueError, match=rf"{name} is .*: give the right one\.$"):
+            read_arrays(tmp_path / name, remedy="give the right one")
+    with pytest.raises(ValueError, match=r"whole\.npz has no array 'c': give the right one\.$"):
+        read_arrays(tmp_path / "whole.npz", ("a", "c"), remedy="give the right one")

@@ -18,7 +18,7 @@ RESULT = {
 
 def text_of(results, title=None) -> str:
     console = Console(file=io.StringIO(), width=120)
-    report.print_results(results, title=title, console=console)
+    console.print(report.results_table(results, title=title))
     return console.file.getvalue()
 
 
