@@ -18,7 +18,7 @@ from rich.console import Console
 from jaxreg import io, scoring
 from jaxreg.compilation import enable_compilation_cache
 from jaxreg.config import Config
-from jaxreg.data import data_root
+from jaxreg.data import root_of
 from jaxreg.options import parse, stop
 from jaxreg.report import results_table
 
@@ -31,8 +31,6 @@ _SUFFIXES = {
     "picture": (".png", ".pdf", ".svg"),
 }
 """The options that name an output, and how its name must end."""
-_WITHOUT_ROOT = ("shapes", "folder")
-"""Sources that read nothing from the folder of the data sets."""
 _TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
 
 
@@ -76,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         _check(options, path)
         config = _evaluated_config(options, path, _given(arguments[1:]))
-        root = None if config.data.name in _WITHOUT_ROOT else data_root(options.data_root, path)
+        root = root_of(config.data, options.data_root, path)
         chosen = {name: getattr(options, name) for name in _CHOICE}
         scored = scoring.evaluate(config, root=root, **chosen)
         # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
@@ -131,7 +129,8 @@ def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Co
     """The configuration to evaluate with, after a word on what differs from the file at `path`.
 
     What the file says of a network is what train.py starts from; a run may have been made with other
-    options, and its network is evaluated as it was trained. Released weights follow the file.
+    options, and its network is evaluated as it was trained. Released weights follow the file, and so
+    do robust rounds, which belong to the pairs and not to the training.
 
     Raises:
       ValueError: an option of the command line changes nothing; says what to give instead.
@@ -144,7 +143,7 @@ def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Co
         return config
     model = dataclasses.asdict(scoring.trained_config(config, checkpoint=options.checkpoint).model)
     changed = {}
-    for name in scoring.AFTER_TRAINING:
+    for name in ("iterations", "n_inliers"):
         value = getattr(config.model, name)
         if f"model.{name}" not in given and model[name] != value:
             changed[name] = model[name]

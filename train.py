@@ -13,7 +13,7 @@ import tyro
 
 from jaxreg.compilation import enable_compilation_cache, restart_with_huge_pages
 from jaxreg.config import Config
-from jaxreg.data import data_root
+from jaxreg.data import root_of
 from jaxreg.options import parse, stop, told
 from jaxreg.pictures import plot_curves
 from jaxreg.pretrained import check_new_name
@@ -43,7 +43,7 @@ def main() -> None:
     try:
         if options.release:
             check_new_name(options.release)
-        root = data_root(options.data_root, path)
+        root = root_of(options.config.data, options.data_root, path)
         train(options.config, workdir, root=root)
         trained = f" ({workdir} holds the whole run: the same command does the rest)"
         plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")

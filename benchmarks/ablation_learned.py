@@ -37,6 +37,7 @@ from jaxreg.matching import incidence, match, matching_maps, neighborhood_sum
 from jaxreg.metrics import pair_errors
 from jaxreg.neighbors import knn
 from jaxreg.procrustes import weighted_procrustes
+from jaxreg.refine import frame
 from jaxreg.types import Pair, RigidTransform
 
 _DENSE, _MODEL = DenseConfig(), ModelConfig()
@@ -82,10 +83,26 @@ class Options:
     """Write the figures to this file."""
 
 
-def register_step(weights, network, x, y, row: Row, *, train: bool):
-    """One step of the paper's method on frozen features: the pose and the updated statistics."""
+class Described(NamedTuple):
+    """A pair in the units of the search, the cosines of its features, and where it came from."""
+
+    x: jax.Array
+    y: jax.Array
+    cosines: jax.Array
+    where: frame.Frame
+
+
+@compilation.jit
+def describe(network, source, reference) -> Described:
+    """What is the same for all rows, compiled once."""
+    where, x, y = enter(source, reference, None, None, _DENSE)
     masks = [jnp.ones(len(p), bool) for p in (x, y)]
-    cosines = jax.lax.stop_gradient(surfaces(x, y, *masks, _DENSE, network)[2])
+    return Described(x, y, surfaces(x, y, *masks, _DENSE, network)[2], where)
+
+
+def register_step(weights, described: Described, row: Row, *, train: bool):
+    """One step of the paper's method on frozen features: the pose and the updated statistics."""
+    x, y, cosines, _ = described
     distance = jnp.exp(weights["log_sharpness"]) * (1 - cosines)
     graphs = [knn(p, _MODEL.k) for p in (x, y)]
     nearest = {
@@ -104,7 +121,7 @@ def register_step(weights, network, x, y, row: Row, *, train: bool):
         structures = (structure(p, graphs[0]) for p in (x, matches.copy))
         inliers = {"params": weights["inliers"], "batch_stats": statistics}
         trust, updated = inlier_network().apply(
-            inliers, *structures, masks[0], train=train, mutable=["batch_stats"]
+            inliers, *structures, jnp.ones(len(x), bool), train=train, mutable=["batch_stats"]
         )
         statistics = updated["batch_stats"]
     source, copy = x, matches.copy
@@ -136,26 +153,37 @@ def init_weights(key: jax.Array) -> dict:
     }
 
 
+@compilation.jit
+def training_pairs(network, keys, clouds):
+    """Pairs of the protocol, described, and the points of each source at the true pose."""
+
+    def one(key_and_cloud):
+        config = protocols.at_size(protocol("resampled"), 4096)
+        pair = protocols.draw(*key_and_cloud, config=config, turned=True)
+        described = describe(network, pair.source.points, pair.reference.points)
+        where = described.where
+        truth = rigid.apply(pair.transform, pair.source.points) - where.reference_centre[None]
+        return described, truth / where.length
+
+    return jax.lax.map(one, (keys, clouds))
+
+
 def fit(row: Row, network, clouds: np.ndarray, seed: int, options: Options) -> dict:
     """Weights that lay the source where the true pose does, after one step."""
-    config = protocols.at_size(protocol("resampled"), 4096)
     rate = optax.cosine_decay_schedule(options.rate, options.steps)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
 
-    def pair_loss(trained, statistics, key, cloud):
-        pair = protocols.draw(key, cloud, config=config, turned=True)
-        where, x, y = enter(pair.source.points, pair.reference.points, None, None, _DENSE)
+    def pair_loss(trained, statistics, described, truth):
         weights = trained | {"statistics": statistics}
-        pose, statistics = register_step(weights, network, x, y, row, train=True)
-        truth = rigid.apply(pair.transform, pair.source.points) - where.reference_centre[None]
-        apart = rigid.apply(pose, x) - truth / where.length
+        pose, statistics = register_step(weights, described, row, train=True)
+        apart = rigid.apply(pose, described.x) - truth
         return jnp.mean(jnp.sum(jnp.abs(apart), axis=1)), statistics
 
     @compilation.jit
-    def step(trained, statistics, state, key, chosen):
+    def step(trained, statistics, state, described, truth):
         def loss(trained):
             each = jax.vmap(pair_loss, in_axes=(None, None, 0, 0), axis_name=BATCH_AXIS)
-            losses, new = each(trained, statistics, jax.random.split(key, len(chosen)), chosen)
+            losses, new = each(trained, statistics, described, truth)
             return jnp.mean(losses), jax.tree.map(lambda s: s[0], new)
 
         (value, statistics), gradient = jax.value_and_grad(loss, has_aux=True)(trained)
@@ -168,7 +196,8 @@ def fit(row: Row, network, clouds: np.ndarray, seed: int, options: Options) -> d
     for number in range(options.steps):
         chosen = clouds[rng.integers(0, len(clouds), options.batch)]
         key = jax.random.fold_in(jax.random.key(seed), number)
-        trained, statistics, state, value = step(trained, statistics, state, key, chosen)
+        made = training_pairs(network, jax.random.split(key, options.batch), chosen)
+        trained, statistics, state, value = step(trained, statistics, state, *made)
         seen.append(float(value))
     few = max(options.steps // 10, 1)
     print(f"  loss {np.mean(seen[:few]):.3f} to {np.mean(seen[-few:]):.3f}", flush=True)
@@ -204,13 +233,12 @@ def test(solve, pairs: list[Pair]) -> tuple[float, float]:
 def solver(row: Row, network, weights):
     """One pair to a pose, compiled."""
 
-    def solve(x, y):
-        where, x, y = enter(x, y, None, None, _DENSE)
-        pose, _ = register_step(weights, network, x, y, row, train=False)
-        shift = pose.translation * where.length + where.reference_centre
-        return RigidTransform(pose.rotation, shift - pose.rotation @ where.source_centre)
+    @compilation.jit
+    def solve(described: Described) -> RigidTransform:
+        pose, _ = register_step(weights, described, row, train=False)
+        return frame.transform_out(described.where, pose)
 
-    return compilation.jit(solve)
+    return lambda x, y: solve(describe(network, x, y))
 
 
 def main() -> None:

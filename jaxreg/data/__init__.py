@@ -19,6 +19,7 @@ __all__ = [
     "make_pair",
     "make_pair_from_scans",
     "pair_sizes",
+    "root_of",
 ]
 
 Split = Literal["train", "validation", "test"]
@@ -45,6 +46,13 @@ def data_root(
             return Path(named)
     beside = None if config_path is None else Path(config_path).parent / "data"
     return beside if beside is not None and beside.is_dir() else None
+
+
+def root_of(
+    config: DataConfig, argument: str | Path | None, config_path: str | Path | None
+) -> Path | None:
+    """`data_root` where the source that `config` names reads from it, else None."""
+    return None if config.name in ("shapes", "folder") else data_root(argument, config_path)
 
 
 def load_shapes(
