@@ -92,9 +92,8 @@ class Described(NamedTuple):
     where: frame.Frame
 
 
-@compilation.jit
 def describe(network, source, reference) -> Described:
-    """What is the same for all rows, compiled once."""
+    """What is the same for all rows."""
     where, x, y = enter(source, reference, None, None, _DENSE)
     masks = [jnp.ones(len(p), bool) for p in (x, y)]
     return Described(x, y, surfaces(x, y, *masks, _DENSE, network)[2], where)
@@ -238,7 +237,10 @@ def solver(row: Row, network, weights):
         pose, _ = register_step(weights, described, row, train=False)
         return frame.transform_out(described.where, pose)
 
-    return lambda x, y: solve(describe(network, x, y))
+    return lambda x, y: solve(describe_once(network, x, y))
+
+
+describe_once = compilation.jit(describe)
 
 
 def main() -> None:

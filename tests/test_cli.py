@@ -236,7 +236,8 @@ def test_files_that_cannot_be_written_are_named(folder, tmp_path, capsys):
 
 def test_las_without_laspy_is_told_before_the_work(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
-    monkeypatch.setattr("jaxreg.register.register", lambda *_, **__: pytest.fail("it registered"))
+    module = importlib.import_module("jaxreg.register")
+    monkeypatch.setattr(module, "register", lambda *_, **__: pytest.fail("it registered"))
     files = (folder / "a.ply", folder / "b.pcd")
     status, out, err = run(capsys, "register", *files, "-o", tmp_path / "out.las")
     assert (status, out) == (cli.BAD_INPUT, "")
