@@ -10,8 +10,11 @@ the first row (`--transforms FILE.npz --refine icp`; its seconds are those of th
 Both leave the weights as they are.
 """
 
+import concurrent.futures
 import dataclasses
 import json
+import multiprocessing
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,6 +77,8 @@ class Options:
     """NPZ file with the predecessor's released weights."""
     predecessor_pairs: int = 0
     again: bool = False
+    jobs: int = 1
+    """Columns at once, each on a core of its own (1: one after the other, on all cores)."""
     data_root: str = ""
 
 
@@ -162,17 +167,46 @@ def table(name: str, options: Options) -> str:
     return f"\n{name} ({dataset}); the paper's MAE(R): {COLUMNS[name].paper}\n\n{body}"
 
 
+def evaluate_if_there(name: str, options: Options, root: Path | None) -> None:
+    """`evaluate`, or a line that says which data is missing."""
+    enable_compilation_cache()
+    try:
+        evaluate(name, options, root)
+    except ValueError as error:
+        print(f"{name} left out: {error}", flush=True)
+
+
+def evaluate_side_by_side(options: Options, root: Path | None) -> None:
+    """All columns, `options.jobs` at once, in processes that keep to one core each."""
+    context = multiprocessing.get_context("spawn")
+    cores = context.Queue()
+    for job in range(options.jobs):
+        cores.put(job)
+    with concurrent.futures.ProcessPoolExecutor(
+        options.jobs, context, initializer=_keep_to_one_core, initargs=(cores,)
+    ) as pool:
+        jobs = [pool.submit(evaluate_if_there, name, options, root) for name in options.only]
+        for job in jobs:
+            job.result()
+
+
+def _keep_to_one_core(cores) -> None:
+    # Before JAX or Open3D count the cores.
+    if hasattr(os, "sched_setaffinity"):
+        allowed = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {allowed[cores.get() % len(allowed)]})
+
+
 def main() -> None:
     """Evaluate what is missing, print all."""
     options = tyro.cli(Options, description=__doc__)
-    enable_compilation_cache()
     root = data_root(options.data_root, CONFIGS / "any.toml")
     Path(options.folder).mkdir(parents=True, exist_ok=True)
-    for name in options.only:
-        try:
-            evaluate(name, options, root)
-        except ValueError as error:  # Data that is not there.
-            print(f"{name} left out: {error}")
+    if options.jobs > 1:
+        evaluate_side_by_side(options, root)
+    else:
+        for name in options.only:
+            evaluate_if_there(name, options, root)
     for name in options.only:
         print(table(name, options))
 
