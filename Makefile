@@ -39,7 +39,7 @@ mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must
 
 baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
 
-tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (30 minutes)
+tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (23 minutes)
 	$(BIN)/python benchmarks/tables.py --jobs 2
 
 figures: $(VENV)/.installed  ## the pictures of the documentation
