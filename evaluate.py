@@ -19,7 +19,7 @@ from jaxreg import io, scoring
 from jaxreg.compilation import enable_compilation_cache
 from jaxreg.config import Config
 from jaxreg.data import root_of
-from jaxreg.options import parse, stop
+from jaxreg.options import parse, stop, told
 from jaxreg.report import results_table
 
 _METHODS = ("checkpoint", "predecessor", "method", "transforms")
@@ -40,8 +40,8 @@ class Options:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     checkpoint: str = ""
-    """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations,
-    n_inliers and robust_rounds of the run unless the command line gives others."""
+    """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations and
+    n_inliers of the run unless the command line gives others."""
     predecessor: str = ""
     """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
     method: str = ""
@@ -82,10 +82,8 @@ def main(arguments: list[str] | None = None) -> None:
             _report(options, path, scored)
         finally:
             _write(options, config, root, scored)
-    except ValueError as error:
-        stop(str(error))
-    except OSError as error:
-        stop(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except (ValueError, OSError) as error:
+        stop(told(error))
     except KeyboardInterrupt:
         stop("interrupted", status=130)
 
@@ -106,17 +104,8 @@ def _check(options: Options, path: Path) -> None:
                     f"--{name.replace('_', '-')} {output}: name a file that ends in "
                     f"{' or '.join(suffixes)}."
                 )
-            _check_place(output, taken)
+            io.check_place(output, taken)
             taken.append(output)
-
-
-def _check_place(path: Path, taken: list[Path]) -> None:
-    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
-    io.check_folder(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory: name a file in it.")
-    if path.resolve() in [other.resolve() for other in taken]:
-        raise ValueError(f"{path} is read or written by this command already: choose another name.")
 
 
 def _given(arguments: list[str]) -> dict[str, str]:

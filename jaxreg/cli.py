@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,6 +21,7 @@ from rich.console import Console
 
 from jaxreg import __version__
 from jaxreg.config import RegisterConfig
+from jaxreg.options import told
 
 SUCCESS, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 2, 3, 130
 
@@ -112,10 +113,8 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         return INTERRUPTED
-    except ValueError as error:
-        message = str(error)
-    except OSError as error:
-        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    except (ValueError, OSError) as error:
+        message = told(error)
     finally:
         gc.enable()
     console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
@@ -179,19 +178,8 @@ def _check_outputs(command: Register) -> None:
         raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
     taken = [command.source, command.reference, *filter(None, [command.initial])]
     for path in _outputs(command):
-        _check_place(path, taken)
+        io.check_place(path, taken)
         taken.append(path)
-
-
-def _check_place(path: Path, taken: Sequence[Path]) -> None:
-    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
-    from jaxreg import io
-
-    io.check_folder(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory: name a file in it.")
-    if path.resolve() in [other.resolve() for other in taken]:
-        raise ValueError(f"{path} is read or written by this command already: choose another name.")
 
 
 @contextlib.contextmanager
@@ -294,7 +282,7 @@ def view_files(command: View) -> int:
 
     if not command.files:
         raise ValueError("no file to view: name at least one.")
-    _check_place(command.output, command.files)
+    io.check_place(command.output, command.files)
     clouds = {str(path): _finite(io.read_cloud(path), path) for path in command.files}
     with _whole(command.output) as part:
         viewer.write_page(part, clouds)

@@ -4,13 +4,14 @@ The file is a plain ``.npz`` of the arrays of its PyTorch state dict under their
 is needed to read it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxreg.config import Config, LossConfig, ModelConfig
+from jaxreg.io.arrays import read_arrays
 from jaxreg.model import Variables
 
 _MODEL = ModelConfig(
@@ -30,34 +31,6 @@ _MODEL = ModelConfig(
     iterations=3,
 )
 _LOSS = LossConfig(rho=0.0, l_in="squared", l_sc="F")
-
-
-def read_arrays(
-    path: str | Path, names: Sequence[str] = (), *, remedy: str
-) -> dict[str, np.ndarray]:
-    """Every array of an ``.npz`` file, by its name. Nothing is ever unpickled.
-
-    Raises:
-      ValueError: the file is missing, a directory, no ``.npz`` or only a part of one, or lacks an
-        array of `names`; the message names the file and ends with `remedy`.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory, not a file: {remedy}.")
-    if not path.exists():
-        raise ValueError(f"no file {path}: {remedy}.")
-    try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if isinstance(content, np.ndarray):
-                raise ValueError("it holds one array, without a name")
-            arrays = {name: content[name] for name in content.files}
-    except Exception as error:  # numpy, zipfile and zlib raise types of their own.
-        raise ValueError(f"{path} is no .npz of arrays ({error}): {remedy}.") from None
-    for name in names:
-        if name not in arrays:
-            raise ValueError(f"{path} has no array '{name}': {remedy}.")
-    return arrays
 
 
 def load_predecessor(path: str | Path) -> tuple[Variables, Config]:

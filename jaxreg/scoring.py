@@ -16,8 +16,9 @@ from jaxreg import checkpoint as checkpoints
 from jaxreg import classical, evaluation, metrics, report
 from jaxreg.config import Config, RefineConfig
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
+from jaxreg.io.arrays import read_arrays
 from jaxreg.pictures import plot_pair
-from jaxreg.predecessor import load_predecessor, read_arrays
+from jaxreg.predecessor import load_predecessor
 from jaxreg.pretrained import available_weights, load_pretrained
 from jaxreg.training import load_checkpoint, shape_points
 from jaxreg.types import Pair, RigidTransform

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg import checkpoint, report, rigid
 from jaxreg.compilation import jit
-from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
-from jaxreg.data import dataset_label, icl_nuim, load_shapes
+from jaxreg.config import Config, PairConfig, TrainConfig
+from jaxreg.data import load_shapes, training_label
 from jaxreg.data.pairs import make_pair
 from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
 from jaxreg.features import BATCH_AXIS
@@ -279,7 +279,7 @@ def release(
         )
     card = {
         "command": command,
-        "data": _training_data(config.data, root),
+        "data": training_label(config.data, root),
         "seed": config.train.seed,
         "step": step,
         "validation": {
@@ -289,20 +289,6 @@ def release(
         },
     }
     save_weights(Path(__file__).parent / "weights", name, variables, config, card)
-
-
-def _training_data(config: DataConfig, root: str | Path | None) -> str:
-    """What a card calls the shapes trained on; `config.label` names those tested on."""
-    match config.name:
-        case "folder":
-            return f"folder {config.folder}"
-        case "icl_nuim" if root is not None:
-            place = icl_nuim.find_file(root, "train").parent.parent
-            return "icl_nuim" if place == Path(root) else place.name
-    found = dataset_label(dataclasses.replace(config, label=""), root)
-    if config.name == "modelnet40":
-        return f"{found}, training shapes: {config.train_categories}"
-    return found
 
 
 def shape_points(pairs: PairConfig) -> int:

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxreg.io.arrays import read_arrays
 from jaxreg.losses import step_losses
 from jaxreg.matching import feature_distance, matching_scores
 from jaxreg.model import init_variables, iterate, neighborhood_graph, point_features
-from jaxreg.predecessor import load_predecessor, read_arrays
+from jaxreg.predecessor import load_predecessor
 from jaxreg.types import PointCloud
 
 # In float64, so that only their rounding is seen; Flax promotes with the float32 that it starts from.

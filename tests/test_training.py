@@ -19,6 +19,7 @@ import pytest
 import train as script
 from jaxreg import checkpoint, training
 from jaxreg.config import Config, DataConfig, TrainConfig, from_dict
+from jaxreg.data import training_label
 from jaxreg.types import RigidTransform
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -377,7 +378,7 @@ def test_the_data_of_a_card_is_what_was_trained_on(tmp_path):
         "folder my_scans": DataConfig(name="folder", folder="my_scans"),
     }
     for name, data in called.items():
-        assert training._training_data(data, tmp_path) == name
+        assert training_label(data, tmp_path) == name
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Shapes to make pairs from: the one way in to every source of data."""
 
+import dataclasses
 import os
 import warnings
 from pathlib import Path
@@ -20,6 +21,7 @@ __all__ = [
     "make_pair_from_scans",
     "pair_sizes",
     "root_of",
+    "training_label",
 ]
 
 Split = Literal["train", "validation", "test"]
@@ -106,6 +108,23 @@ def dataset_label(config: DataConfig, root: str | Path | None) -> str:
         return config.label or config.name
     sources = {"icl_nuim": icl_nuim, "seven_scenes": seven_scenes}
     return sources[config.name].label(root) if config.name in sources else config.name
+
+
+def training_label(config: DataConfig, root: str | Path | None) -> str:
+    """What a card calls the shapes trained on; `config.label` names those tested on.
+
+    Errors as `dataset_label`.
+    """
+    match config.name:
+        case "folder":
+            return f"folder {config.folder}"
+        case "icl_nuim" if root is not None:
+            place = icl_nuim.find_file(root, "train").parent.parent
+            return "icl_nuim" if place == Path(root) else place.name
+    found = dataset_label(dataclasses.replace(config, label=""), root)
+    if config.name == "modelnet40":
+        return f"{found}, training shapes: {config.train_categories}"
+    return found
 
 
 def _load_procedural(

@@ -1,6 +1,6 @@
 """Clouds from and to files: one function each way, the format chosen by the suffix."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +90,15 @@ def check_writable(path: Path) -> None:
     if path.suffix.lower() in (".las", ".laz"):
         las.check_installed(path)
     check_folder(path)
+
+
+def check_place(path: Path, taken: Sequence[Path]) -> None:
+    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
+    check_folder(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory: name a file in it.")
+    if path.resolve() in [other.resolve() for other in taken]:
+        raise ValueError(f"{path} is read or written by this command already: choose another name.")
 
 
 def check_folder(path: Path) -> None:

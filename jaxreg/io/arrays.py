@@ -1,5 +1,6 @@
 """NumPy's own files: NPY with an array (n, 3), NPZ with such an array in it. Never unpickled."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,45 @@ def read(path: Path) -> np.ndarray:
     or the only one that could be a cloud.
     """
     try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if not isinstance(content, np.ndarray):
-                content = {name: content[name] for name in content.files}
+        content = _loaded(path)
     except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
         hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
         raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
     return _chosen(content, path) if isinstance(content, dict) else _points(content, str(path))
+
+
+def read_arrays(
+    path: str | Path, names: Sequence[str] = (), *, remedy: str
+) -> dict[str, np.ndarray]:
+    """Every array of an ``.npz`` file, by its name, whatever it holds.
+
+    Raises:
+      ValueError: the file is missing, a directory, no ``.npz`` or only a part of one, or lacks an
+        array of `names`; the message names the file and ends with `remedy`.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory, not a file: {remedy}.")
+    if not path.exists():
+        raise ValueError(f"no file {path}: {remedy}.")
+    try:
+        arrays = _loaded(path)
+        if isinstance(arrays, np.ndarray):
+            raise ValueError("it holds one array, without a name")
+    except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
+        raise ValueError(f"{path} is no .npz of arrays ({error}): {remedy}.") from None
+    for name in names:
+        if name not in arrays:
+            raise ValueError(f"{path} has no array '{name}': {remedy}.")
+    return arrays
+
+
+def _loaded(path: Path) -> np.ndarray | dict[str, np.ndarray]:
+    with path.open("rb") as file:
+        content = np.load(file, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            return content
+        return {name: content[name] for name in content.files}
 
 
 def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:
