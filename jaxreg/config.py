@@ -254,7 +254,9 @@ class DenseConfig:
     matches: int = 3
     """Most similar points of every point that become candidates, in both directions."""
     candidates: int = 768
-    """Candidates kept, the clearest first; each gives a pose."""
+    """Candidates kept, the clearest first."""
+    seeds: int = 512
+    """Of these the first ones, which give a pose each."""
     partners: int = 12
     """Other candidates that a pose is computed from."""
     tolerance: float = 0.08
@@ -279,11 +281,11 @@ class DenseConfig:
     """or this distance."""
     coarse_step: int = 2
     """Every so-manieth point is screened and refined coarsely."""
-    coarse_widths: tuple[float, ...] = (0.15, 0.12, 0.1, 0.08, 0.06, 0.05)
+    coarse_widths: tuple[float, ...] = (0.15, 0.12, 0.09, 0.07, 0.05)
     """Gaussian width of every coarse iteration."""
     coarse_thickness: float = 0.1
     """Weight of the distance along a surface, against that across it, in these."""
-    fine_widths: tuple[float, ...] = (0.1, 0.08, 0.06, 0.05, 0.05)
+    fine_widths: tuple[float, ...] = (0.1, 0.07, 0.05, 0.05)
     """Gaussian width of every fine iteration."""
     thickness: float = 0.01
     """Variance across a surface, in units of the variance along it."""
@@ -315,6 +317,10 @@ class DenseConfig:
     """Cost of a near point away from all rims: it should match, not only be near."""
     beside: float = 4.1
     """Cost of a point that lies beside the inside of the other surface."""
+    doubt: float = 0.03
+    """Poses whose plausibility is less than this below the best one's are a close call,"""
+    flush: float = 0.25
+    """in which a point that lies flush with the other surface is worth this much more."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,8 +37,8 @@ def knn(
 
     If ``idx[i, r] = j`` then ``points[j]`` is the (r+1)-th nearest point of ``points[i]`` with
     ``j != i``. Coincident points are neighbours of each other at distance 0. Equal distances are
-    ordered by coordinates, not by row, so that permuting the points permutes the graph. Where fewer
-    than `k` valid others exist, a point fills the rest of its list with itself.
+    ordered by coordinates (their bits), not by row, so that permuting the points permutes the graph.
+    Where fewer than `k` valid others exist, a point fills the rest of its list with itself.
 
     Raises:
       ValueError: `points` is not ``(n, 3)``, or not ``1 <= k < n``.
@@ -50,8 +50,8 @@ def knn(
             f"k = {k} neighbours do not exist in a cloud of n = {n} points: "
             "choose 1 <= k < n, or give more points."
         )
-    points = jax.lax.stop_gradient(without_padding(points, mask))
-    order = jnp.lexsort(points.T)
+    points = jax.lax.stop_gradient(without_padding(jnp.asarray(points), mask))
+    order = _scattered(points)
     candidates, row = points[order], jnp.arange(n, dtype=order.dtype)
 
     def of_rows(row):
@@ -100,6 +100,22 @@ def nearest_in(
     # argmin, which carries both through one reduction, element by element.
     column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
     return row_min(jnp.where(at_row_min(distance), column, others.shape[0] - 1))
+
+
+def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:
+    """An order as good as random that depends on the points alone: not on their rows, nor on padding.
+
+    A selection on a CPU keeps the best so far, and replaces them rarely where near points come at
+    random: that of 16 in 768 takes two thirds of its time after sorting by x.
+    """
+    width = jnp.finfo(points.dtype).bits
+    bits = jax.lax.bitcast_convert_type(points, jnp.dtype(f"uint{width}"))
+    # Multiplicative hashing (Knuth, volume 3, section 6.4).
+    odd = jnp.asarray(0x9E3779B97F4A7C15 % 2**width, bits.dtype)
+    mixed = jnp.zeros_like(bits[:, 0])
+    for axis in range(3):
+        mixed = (mixed ^ bits[:, axis]) * odd
+    return jnp.lexsort((*points.T, mixed))
 
 
 def _check_points(points: Array) -> None:

@@ -18,16 +18,18 @@ def pose_hypotheses(
     reference: Float[Array, "c 3"],
     first: Float[Array, "c c"],
     *,
+    seeds: int,
     partners: int,
 ) -> RigidTransform:
-    """One pose (leading axis c) from every candidate together with its `partners` best partners.
+    """One pose (leading axis s) from each of the first `seeds` candidates and its best `partners`.
 
     Partners are ranked by second-order compatibility; the weights of the Procrustes solution are
-    the leading eigenvector of the compatibility among them. Every candidate is a seed: where nine
-    of ten are wrong, a choice of seeds loses the right ones first.
+    the leading eigenvector of the compatibility among them. The seeds are the clearest candidates,
+    not those that agree with most others: where nine of ten are wrong, that loses the right ones.
     """
-    _, members = jax.lax.optimization_barrier(jax.lax.top_k(second_order(first), partners))
-    own = jnp.arange(first.shape[0], dtype=members.dtype)[:, None]
+    among = second_order(first, seeds)
+    _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, partners))
+    own = jnp.arange(seeds, dtype=members.dtype)[:, None]
     members = jnp.concatenate([own, members], axis=1)
     local = first[members[:, :, None], members[:, None, :]]
     weights = spectral_weights(local)

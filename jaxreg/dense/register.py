@@ -18,7 +18,13 @@ from jaxreg.dense.learned import Network, learned_features
 from jaxreg.dense.moments import Descriptors, moment_descriptors, openness, standardized
 from jaxreg.dense.nearest import NearestGrid, nearest_grid, nearest_packed
 from jaxreg.dense.surface import Surface, thinned
-from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
+from jaxreg.dense.verification import (
+    Evidence,
+    evidence,
+    evidence_by_grid,
+    plausibility,
+    settle,
+)
 from jaxreg.neighbors import squared_distances
 from jaxreg.numerics import safe_sqrt
 from jaxreg.refine import frame
@@ -209,7 +215,11 @@ def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: 
         normal_tolerance=config.normal_tolerance,
     )
     return pose_hypotheses(
-        source.points[i], reference.points[j], first, partners=min(config.partners, len(i) - 1)
+        source.points[i],
+        reference.points[j],
+        first,
+        seeds=min(config.seeds, len(i)),
+        partners=min(config.partners, len(i) - 1),
     )
 
 
@@ -306,6 +316,7 @@ def _ranked(
     )
     # Again, since alignment may have turned a pose out of the bounds of the search.
     score = _bounded(_score(found, config), poses, largest_angle)
+    score = settle(score, found.flush, doubt=config.doubt, worth=config.flush)
     score, order = jax.lax.top_k(score, len(score))
     return Search(best_of(poses, order), score)
 

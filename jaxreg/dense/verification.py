@@ -25,13 +25,15 @@ class Evidence(NamedTuple):
 
     `match`: close to the other surface, on its plane and facing its way. `alike`: close to a point
     around which the surface looks alike (may be negative). `within`: close, both points away from
-    any rim. `beside`: a little off the other surface where that has no rim.
+    any rim. `beside`: a little off the other surface where that has no rim. `flush`: close, and on the
+    other surface's plane to a third of the width that `match` allows.
     """
 
     match: Float[Array, ""]
     alike: Float[Array, ""]
     within: Float[Array, ""]
     beside: Float[Array, ""]
+    flush: Float[Array, ""]
 
 
 def evidence(
@@ -49,7 +51,8 @@ def evidence(
     c the cosine of the two normals, s that of the local features, ``k = exp(-d^2 / 2 width^2)`` and
     ``i = max(0, 1 - openness / rim)`` of the point (i) and of the other (i'): ``match =
     E[k exp(-h^2 / 2 plane_width^2) c^2]``, ``alike = E[k s]``, ``within = E[k i i']``, ``beside =
-    E[i']`` over the points with d between 1.5 and 3 `width` (0 for the others).
+    E[i']`` over the points with d between 1.5 and 3 `width` (0 for the others), ``flush =
+    E[k exp(-h^2 / 2 (plane_width / 3)^2)]``.
     """
     moved = move(pose, source)
     forward = nearest_packed(moved.points, reference.points, reference.mask)
@@ -100,6 +103,19 @@ def plausibility(
     return evidence.match + alike * evidence.alike - against
 
 
+def settle(
+    score: Float[Array, "s"], flush: Float[Array, "s"], *, doubt: float, worth: float
+) -> Float[Array, "s"]:
+    """The scores, those less than `doubt` below the best changed by how much more flush they lie.
+
+    Added is ``worth * (flush - that of the best)``. Sides of an object that differ by a small part
+    score alike; on all pairs, crops above all, the same term would do harm.
+    """
+    best = jnp.argmax(score)
+    change = worth * (flush - flush[best])
+    return jnp.where(score > score[best] - doubt, score + change, score)
+
+
 @jax.jit  # Traced once for both directions.
 def _one_way(
     moved: Surface,
@@ -108,7 +124,7 @@ def _one_way(
     width: Float[Array, ""] | float,
     plane_width: Float[Array, ""] | float,
     rim: Float[Array, ""] | float,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, ...]:
     residual = moved.points - other.points[nearest]
     normal = other.normals[nearest]
     squared = jnp.sum(residual**2, axis=-1)
@@ -116,6 +132,7 @@ def _one_way(
     facing = jnp.sum(moved.normals * normal, axis=-1) ** 2
     close = jnp.exp(-squared / (2 * width**2))
     match = close * jnp.exp(-(height**2) / (2 * plane_width**2)) * facing
+    flush = close * jnp.exp(-(height**2) / (2 * (plane_width / 3) ** 2))
     alike = close * jnp.sum(moved.local * other.local[nearest], axis=-1)
     inside, others_inside = (
         jnp.maximum(0, 1 - openness / rim) for openness in (moved.openness, other.openness[nearest])
@@ -125,5 +142,5 @@ def _one_way(
     count = jnp.maximum(jnp.sum(moved.mask), 1).astype(close.dtype)
     return tuple(
         jnp.sum(jnp.where(moved.mask, value, 0)) / count
-        for value in (match, alike, close * inside * others_inside, beside)
+        for value in (match, alike, close * inside * others_inside, beside, flush)
     )

@@ -124,11 +124,11 @@ def gicp_step(
     moved, target = rigid.apply(pose, source[pairs.source_index]), reference[pairs.reference_index]
     rotation = pose.rotation[None]
     turned = jnp.matmul(
-        jnp.matmul(rotation, source_covariances[pairs.source_index], precision=Precision.HIGHEST),
+        jnp.matmul(rotation, source_covariances, precision=Precision.HIGHEST),
         rotation.mT,
         precision=Precision.HIGHEST,
     )
-    combined = turned + reference_covariances[pairs.reference_index]
+    combined = turned[pairs.source_index] + reference_covariances[pairs.reference_index]
     # Padding may hold NaN covariances; its pairs count for nothing.
     identity = jnp.eye(3, dtype=combined.dtype)[None]
     combined = jnp.where(pairs.mask[:, None, None], combined, identity)

@@ -51,7 +51,7 @@ def test_right_candidates_agree_fully_and_outweigh_wrong_ones(seed):
             for i in (1, 25)
         ]
     )  # noqa: E501
-    np.testing.assert_allclose(second_order(first)[np.ix_([1, 25], [0, 30])], loop, atol=1e-9)
+    np.testing.assert_allclose(second_order(first, 26)[np.ix_([1, 25], [0, 30])], loop, atol=1e-9)
 
 
 def test_spectral_weights_are_the_leading_eigenvector(seed):

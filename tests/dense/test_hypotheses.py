@@ -15,7 +15,8 @@ def test_right_candidates_give_the_pose_among_wrong_ones(seed):
     q = np.where(np.arange(60)[:, None] < 20, p @ turn.T + 2, rng.normal(size=(60, 3)))
     change = np.abs(np.linalg.norm(p[:, None] - p, axis=2) - np.linalg.norm(q[:, None] - q, axis=2))
     first = np.maximum(0, 1 - (change / 0.05) ** 2) * (1 - np.eye(60))
-    poses = pose_hypotheses(*map(jnp.asarray, (p, q, first)), partners=8)
+    poses = pose_hypotheses(*map(jnp.asarray, (p, q, first)), seeds=40, partners=8)
+    assert len(poses.rotation) == 40
     np.testing.assert_allclose(poses.rotation[:20], np.tile(turn, (20, 1, 1)), atol=0.05)
     np.testing.assert_allclose(poses.translation[:20], 2, atol=0.1)
     np.testing.assert_allclose(np.linalg.det(poses.rotation), 1, atol=1e-9)

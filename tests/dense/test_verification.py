@@ -5,7 +5,13 @@ from scipy.spatial.transform import Rotation
 from jaxreg import rigid
 from jaxreg.dense.nearest import nearest_grid
 from jaxreg.dense.surface import Surface
-from jaxreg.dense.verification import Evidence, evidence, evidence_by_grid, plausibility
+from jaxreg.dense.verification import (
+    Evidence,
+    evidence,
+    evidence_by_grid,
+    plausibility,
+    settle,
+)
 from jaxreg.types import RigidTransform
 
 
@@ -27,6 +33,8 @@ def test_a_shifted_plane_by_its_equations():
         found = evidence(identity, plane(0.0, 0.1), plane(shift, 0.2, local=(0.6, 0.8)), **WIDTHS)
         expected = near * np.exp(-(shift**2) / (2 * 0.02**2))
         np.testing.assert_allclose(found.match, expected, rtol=1e-6)
+        flush = near * np.exp(-(shift**2) / (2 * (0.02 / 3) ** 2))
+        np.testing.assert_allclose(found.flush, flush, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(found.alike, 0.6 * near, rtol=1e-6)
         np.testing.assert_allclose(found.within, (1 - 0.4) * (1 - 0.8) * near, rtol=1e-6)
         assert found.beside == 0
@@ -79,6 +87,13 @@ def test_grids_give_about_the_evidence_and_every_other_point_is_enough(seed):
 
 
 def test_plausibility_is_linear_in_the_evidence():
-    found = Evidence(*(jnp.asarray(x) for x in (1.5, 0.6, 0.3, 0.1)))
+    found = Evidence(*(jnp.asarray(x) for x in (1.5, 0.6, 0.3, 0.1, 0.9)))
     score = plausibility(found, alike=0.5, within=2.0, beside=4.0)
     np.testing.assert_allclose(score, 1.5 + 0.3 - 0.6 - 0.4)
+
+
+def test_a_close_call_goes_to_the_pose_that_lies_flush():
+    score, flush = jnp.asarray([0.50, 0.51, 0.40, 0.499]), jnp.asarray([0.9, 0.7, 2.0, 0.6])
+    found = settle(score, flush, doubt=0.03, worth=0.25)
+    # The third is no close call, however flush it lies.
+    np.testing.assert_allclose(found, [0.55, 0.51, 0.40, 0.474])

@@ -102,10 +102,13 @@ def test_gates_and_widths():
     )
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.7, 1.0])
-def test_quantile_counts_the_valid_values(share, seed):
+def test_quantile_counts_the_valid_values(share, dtype, seed):
     rng = np.random.default_rng(seed)
-    values, mask = rng.uniform(size=20), np.arange(20) % 2 == 0
+    # From tiny to infinite, some of them equal, as distances may be.
+    values = rng.choice([0.0, 1e-30, np.inf, *rng.uniform(size=9)], 20).astype(dtype)
+    mask = np.arange(20) % 2 == 0
     result = masked_quantile(jnp.asarray(values), jnp.asarray(mask), share)
     valid = np.sort(values[mask])
     assert result == next(v for v in valid if np.mean(valid <= v) >= share - 1e-9)
