@@ -45,7 +45,8 @@ class Options:
     predecessor: str = ""
     """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
     method: str = ""
-    """Another method: identity, icp, or a baseline such as open3d_fgr (a wrong name lists them)."""
+    """Another method: register, register_dense, register_dense_learned, icp or identity; or a baseline
+    such as open3d_fgr (a wrong name lists them)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
     refine: str = ""

@@ -103,13 +103,19 @@ def register_step(weights, described: Described, row: Row, *, train: bool):
     """One step of the paper's method on frozen features: the pose and the updated statistics."""
     x, y, cosines, _ = described
     distance = jnp.exp(weights["log_sharpness"]) * (1 - cosines)
-    graphs = [knn(p, _MODEL.k) for p in (x, y)]
+    most = max(_MODEL.k, _MODEL.k_matching)
+    graphs = [knn(p, most) for p in (x, y)]
     nearest = {
         "none": lambda: None,
         "self": lambda: distance,
         "gather": lambda: neighborhood_sum(distance, *(incidence(g[:, :1]) for g in graphs)),
     }[row.one_nn]()
-    maps = matching_maps(distance, nearest, *map(incidence, graphs), alpha=_MODEL.alpha)
+    maps = matching_maps(
+        distance,
+        nearest,
+        *(incidence(g[:, : _MODEL.k_matching]) for g in graphs),
+        alpha=_MODEL.alpha,
+    )
     matches = match(maps.dual, maps.final, y)
     statistics = weights["statistics"]
     if row.weights == "equal":
@@ -117,7 +123,7 @@ def register_step(weights, described: Described, row: Row, *, train: bool):
     elif row.weights == "peaks":
         trust = matches.final_peak
     else:
-        structures = (structure(p, graphs[0]) for p in (x, matches.copy))
+        structures = (structure(p, graphs[0][:, : _MODEL.k]) for p in (x, matches.copy))
         inliers = {"params": weights["inliers"], "batch_stats": statistics}
         trust, updated = inlier_network().apply(
             inliers, *structures, jnp.ones(len(x), bool), train=train, mutable=["batch_stats"]

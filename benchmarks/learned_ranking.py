@@ -85,7 +85,7 @@ def facts(moved: Surface, other: Surface) -> jax.Array:
 
 def choices(options: Options):
     """A compiled function of a pair: the poses of the search and everything known about them."""
-    config = dataclasses.replace(DenseConfig(), unit=1.0, aligned=options.aligned)
+    config = dataclasses.replace(DenseConfig(), unit=1.0, aligned=options.aligned, doubt=0.0)
 
     def found(x: jax.Array, y: jax.Array):
         search = search_dense(x, y, config=config)
@@ -101,7 +101,7 @@ def choices(options: Options):
                 plane_width=config.plane_width,
                 rim=config.rim,
             )
-            return facts(moved, reference), facts(reference, moved), jnp.stack(terms)
+            return facts(moved, reference), facts(reference, moved), jnp.stack(terms[:4])
 
         return search, jax.lax.map(judge, search.poses)
 

@@ -19,6 +19,8 @@ from jaxreg.compilation import jit
 from jaxreg.config import ModelConfig, PairConfig, RefineConfig
 from jaxreg.cpu import map_pairs
 from jaxreg.data.pairs import make_pair, make_pair_from_scans
+from jaxreg.dense import register_dense
+from jaxreg.dense.learned import Network
 from jaxreg.model import Variables, iterate
 from jaxreg.refine.gicp import gicp
 from jaxreg.refine.icp import icp
@@ -181,6 +183,18 @@ def icp_method(pair: Pair) -> RigidTransform:
         reference_mask=reference.mask,
     )
     return map_pairs(one)(pair.source, pair.reference)
+
+
+def dense_method(network: Network | None = None) -> Method:
+    """`register_dense` of this library, from any start; with the features of `network`."""
+
+    def one(source, reference):
+        masks = {"source_mask": source.mask, "reference_mask": reference.mask}
+        found = register_dense(source.points, reference.points, network=network, **masks)
+        return RigidTransform(found.rotation, found.translation)
+
+    register_batch = jit(map_pairs(one))
+    return lambda pair: register_batch(pair.source, pair.reference)
 
 
 def refined_method(method: Method, refine: Refinement) -> Method:

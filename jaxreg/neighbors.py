@@ -115,6 +115,7 @@ def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:
     mixed = jnp.zeros_like(bits[:, 0])
     for axis in range(3):
         mixed = (mixed ^ bits[:, axis]) * odd
+        mixed = mixed ^ (mixed >> (width // 2))  # The low bits of round numbers are all zero.
     return jnp.lexsort((*points.T, mixed))
 
 

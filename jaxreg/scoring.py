@@ -16,10 +16,12 @@ from jaxreg import checkpoint as checkpoints
 from jaxreg import classical, evaluation, metrics, report
 from jaxreg.config import Config, RefineConfig
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
+from jaxreg.dense import load_network
 from jaxreg.io.arrays import read_arrays
 from jaxreg.pictures import plot_pair
 from jaxreg.predecessor import load_predecessor
 from jaxreg.pretrained import available_weights, load_pretrained
+from jaxreg.register import register
 from jaxreg.training import load_checkpoint, shape_points
 from jaxreg.types import Pair, RigidTransform
 
@@ -40,7 +42,10 @@ class Scored(NamedTuple):
 
 
 def choose_method(name: str) -> evaluation.Method:
-    """A method that needs no weights: `identity`, `icp` (ours), or a classical baseline.
+    """A method that no training of a network is needed for.
+
+    `identity`; of this library `icp`, `register` (with all its defaults), `register_dense` and
+    `register_dense_learned` (with its released features); or a classical baseline.
 
     Raises:
       ValueError: the name is unknown (the message lists them), or its library is not installed.
@@ -50,6 +55,12 @@ def choose_method(name: str) -> evaluation.Method:
             return evaluation.identity_method
         case "icp":
             return evaluation.icp_method
+        case "register":
+            return evaluation.host_method(lambda x, y: RigidTransform(*register(x, y)[:2]))
+        case "register_dense":
+            return evaluation.dense_method()
+        case "register_dense_learned":
+            return evaluation.dense_method(load_network())
     return evaluation.host_method(classical.choose(name))
 
 

@@ -143,5 +143,6 @@ _UNSEARCHED = np.array([1.43, 1.19, 4.33, -3.04, 6.65, 3.13])
 Fitted by benchmarks/calibrate_success.py (2026-11-26) to 200 pairs of procedural shapes and 200 of
 ModelNet40's training shapes: full, noisy and cropped samplings, unrelated shapes, ends of one shape.
 Right poses called a failure on these pairs: 6, 4 and 22 %; no unrelated pair, but 11 % of the ends of
-one shape (many are congruent, as those of a box are) are called a success.
+one shape (many are congruent, as those of a box are) are called a success. A new fit with the search
+that settles close calls (`dense.verification.settle`) judged other pairs no better.
 """

@@ -113,6 +113,16 @@ def test_a_refined_method_says_so_and_is_better(config):
     assert refined["mie_r_deg"] < plain["mie_r_deg"]
 
 
+@pytest.mark.parametrize("method", ["register", "register_dense", "register_dense_learned"])
+def test_the_methods_for_any_rotation_are_scored_by_name(config, method):
+    pairs = PairConfig(512, kept=400, sampling="disjoint", rotation="full")
+    easy = dataclasses.replace(config, test_pairs=pairs)
+    result = scoring.score(easy, method=method, pairs=1)
+    assert result["method"] == method
+    # Two samplings of a shape of the configuration that share no point.
+    assert result["mie_r_deg"] < 5
+
+
 def test_pairs_of_a_file_are_scored_in_their_own_pose(tmp_path):
     arrays = write_published(tmp_path / "rooms", points=40)
     config = from_dict(

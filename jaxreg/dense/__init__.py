@@ -1,7 +1,7 @@
 """Registration for any rotation, of clouds that share no point: `register_dense`.
 
 Every stage is dense and of a fixed shape: products of (n, n) matrices instead of neighbour lists,
-one hypothesis from every candidate instead of sampling, a grid instead of a tree.
+one hypothesis from each of the clearest candidates instead of sampling, a grid instead of a tree.
 """
 
 from jaxreg.dense.learned import load_network

@@ -37,7 +37,10 @@ _RMS_OF_UNIT_SPHERE = 0.5
 
 
 class Search(NamedTuple):
-    """The aligned poses (leading axis), best first, in the original frame, and their plausibility."""
+    """The aligned poses (leading axis), best first, in the original frame, and their plausibility.
+
+    In close calls it is that of `verification.settle`.
+    """
 
     poses: RigidTransform
     score: Float[Array, "s"]
@@ -302,7 +305,7 @@ def _ranked(
     largest_angle,
     config: DenseConfig,
 ) -> Search:
-    """The poses, the most plausible first, and their plausibility."""
+    """The poses, the most plausible first, and their plausibility, settled in close calls."""
     found = jax.lax.map(
         lambda pose: evidence(
             pose,

@@ -109,7 +109,7 @@ def settle(
     """The scores, those less than `doubt` below the best changed by how much more flush they lie.
 
     Added is ``worth * (flush - that of the best)``. Sides of an object that differ by a small part
-    score alike; on all pairs, crops above all, the same term would do harm.
+    score alike. On all pairs the term gains less (RESULTS.md, *Close calls*).
     """
     best = jnp.argmax(score)
     change = worth * (flush - flush[best])

@@ -166,7 +166,7 @@ def masked_quantile(
     rank = jnp.ceil(share * count.astype(values.dtype) - 1e-3).astype(jnp.int32)
     integer = jnp.uint32 if values.dtype == jnp.float32 else jnp.uint64
     high = jnp.iinfo(integer).bits - 1
-    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(values), integer)
+    bits = jax.lax.bitcast_convert_type(jnp.abs(jax.lax.stop_gradient(values)), integer)
     bits = jnp.where(mask, bits, jnp.asarray(jnp.iinfo(integer).max, integer))
 
     def step(k: Array | int, found: Array) -> Array:
@@ -175,7 +175,9 @@ def masked_quantile(
 
     # The bit of the sign is 0.
     found = jax.lax.fori_loop(1, high + 1, step, jnp.zeros((), integer))
-    return jnp.where(count > 0, values[jnp.argmax(bits == found)], 0)
+    # The nearest one, since XLA may have computed the values anew, to another last bit.
+    apart = jnp.maximum(bits, found) - jnp.minimum(bits, found)
+    return jnp.where(count > 0, values[jnp.argmin(apart)], 0)
 
 
 def check_options(*, iterations: int, trim: float, anneal: float) -> None:

@@ -114,6 +114,11 @@ def test_quantile_counts_the_valid_values(share, dtype, seed):
     assert result == next(v for v in valid if np.mean(valid <= v) >= share - 1e-9)
 
 
+def test_quantile_of_a_share_below_one_value_is_the_smallest_valid_one():
+    values, mask = jnp.asarray([9.0, 0.5, 0.25, jnp.nan]), jnp.asarray([False, True, True, False])
+    assert masked_quantile(values, mask, 1e-4) == 0.25
+
+
 def test_widths_fall_by_equal_factors_to_one():
     widths = widenings(4, 8.0, jnp.dtype("float64"))
     np.testing.assert_allclose(widths, [8, 4, 2, 1])
