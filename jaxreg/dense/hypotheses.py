@@ -1,4 +1,4 @@
-"""A pose from each of the clearest candidates and its partners, a quick score of each, and the distinct best."""
+"""A pose from each of the clearest candidates, a quick score of each, and the distinct best."""
 
 import jax
 import jax.numpy as jnp
