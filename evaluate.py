@@ -46,7 +46,7 @@ class Options:
     """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
     method: str = ""
     """Another method: register, register_dense, register_dense_learned, icp or identity; or a baseline
-    such as open3d_fgr (a wrong name lists them)."""
+    such as open3d_fgr (a wrong name lists the baselines)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
     refine: str = ""

@@ -26,19 +26,20 @@ import tyro
 
 from benchmarks import learned_features, protocols
 from jaxreg import compilation, rigid
-from jaxreg.config import DenseConfig, ModelConfig, load_config
+from jaxreg.config import DenseConfig, ModelConfig
 from jaxreg.data import shapes
 from jaxreg.dense.learned import load_network
 from jaxreg.dense.register import enter, search_dense, surfaces
 from jaxreg.features import BATCH_AXIS
 from jaxreg.inliers import InlierNetwork, select_inliers
 from jaxreg.invariants import geometric_structure
-from jaxreg.matching import incidence, match, matching_maps, neighborhood_sum
+from jaxreg.matching import match, matching_maps, neighborhood_sum
 from jaxreg.metrics import pair_errors
+from jaxreg.model import neighborhood_graph
 from jaxreg.neighbors import knn
 from jaxreg.procrustes import weighted_procrustes
 from jaxreg.refine import frame
-from jaxreg.types import Pair, RigidTransform
+from jaxreg.types import Pair, PointCloud, RigidTransform
 
 _DENSE, _MODEL = DenseConfig(), ModelConfig()
 TESTED = ("resampled", "resampled_jitter", "crops70")
@@ -103,19 +104,16 @@ def register_step(weights, described: Described, row: Row, *, train: bool):
     """One step of the paper's method on frozen features: the pose and the updated statistics."""
     x, y, cosines, _ = described
     distance = jnp.exp(weights["log_sharpness"]) * (1 - cosines)
-    most = max(_MODEL.k, _MODEL.k_matching)
-    graphs = [knn(p, most) for p in (x, y)]
+    everywhere = [jnp.ones(len(p), bool) for p in (x, y)]
+    graphs = [
+        neighborhood_graph(PointCloud(*c), _MODEL) for c in zip((x, y), everywhere, strict=True)
+    ]
     nearest = {
         "none": lambda: None,
         "self": lambda: distance,
-        "gather": lambda: neighborhood_sum(distance, *(incidence(g[:, :1]) for g in graphs)),
+        "gather": lambda: neighborhood_sum(distance, *(g.nearest for g in graphs)),
     }[row.one_nn]()
-    maps = matching_maps(
-        distance,
-        nearest,
-        *(incidence(g[:, : _MODEL.k_matching]) for g in graphs),
-        alpha=_MODEL.alpha,
-    )
+    maps = matching_maps(distance, nearest, *(g.matching for g in graphs), alpha=_MODEL.alpha)
     matches = match(maps.dual, maps.final, y)
     statistics = weights["statistics"]
     if row.weights == "equal":
@@ -123,10 +121,10 @@ def register_step(weights, described: Described, row: Row, *, train: bool):
     elif row.weights == "peaks":
         trust = matches.final_peak
     else:
-        structures = (structure(p, graphs[0][:, : _MODEL.k]) for p in (x, matches.copy))
+        structures = (structure(p, graphs[0].neighbors) for p in (x, matches.copy))
         inliers = {"params": weights["inliers"], "batch_stats": statistics}
         trust, updated = inlier_network().apply(
-            inliers, *structures, jnp.ones(len(x), bool), train=train, mutable=["batch_stats"]
+            inliers, *structures, everywhere[0], train=train, mutable=["batch_stats"]
         )
         statistics = updated["batch_stats"]
     source, copy = x, matches.copy
@@ -163,7 +161,7 @@ def training_pairs(network, keys, clouds):
     """Pairs of the protocol, described, and the points of each source at the true pose."""
 
     def one(key_and_cloud):
-        config = protocols.at_size(protocol("resampled"), 4096)
+        config = learned_features.pair_config("resampled")
         pair = protocols.draw(*key_and_cloud, config=config, turned=True)
         described = describe(network, pair.source.points, pair.reference.points)
         where = described.where
@@ -209,14 +207,9 @@ def fit(row: Row, network, clouds: np.ndarray, seed: int, options: Options) -> d
     return trained | {"statistics": statistics}
 
 
-def protocol(name: str):
-    """The pairs of a file in configs/."""
-    return load_config(protocols.CONFIGS / f"modelnet40_{name}.toml").test_pairs
-
-
 def draw_pairs(name: str, clouds: list[np.ndarray], options: Options) -> list[Pair]:
     """Pairs to test on, the same for every row."""
-    config = protocols.at_size(protocol(name), 4096)
+    config = learned_features.pair_config(name)
     key = jax.random.key(options.test_seed)
     return [
         protocols.draw(

@@ -101,7 +101,8 @@ def choices(options: Options):
                 plane_width=config.plane_width,
                 rim=config.rim,
             )
-            return facts(moved, reference), facts(reference, moved), jnp.stack(terms[:4])
+            weighed = jnp.stack(terms[:4])  # What `plausibility` weighs: all but `flush`.
+            return facts(moved, reference), facts(reference, moved), weighed
 
         return search, jax.lax.map(judge, search.poses)
 

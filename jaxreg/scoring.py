@@ -48,7 +48,7 @@ def choose_method(name: str) -> evaluation.Method:
     `register_dense_learned` (with its released features); or a classical baseline.
 
     Raises:
-      ValueError: the name is unknown (the message lists them), or its library is not installed.
+      ValueError: an unknown name (the message lists the baselines), or its library is not installed.
     """
     match name:
         case "identity":
