@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-CHECKED := jaxreg tests $(wildcard *.py benchmarks examples)
+CHECKED := jaxreg tests $(wildcard *.py) benchmarks research examples
 export JAX_PLATFORMS ?= cpu
 
 .PHONY: help demo test coverage slow lint types fuzz mutants tables figures baselines clean
@@ -40,10 +40,10 @@ mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must
 baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
 
 tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (23 minutes)
-	$(BIN)/python benchmarks/tables.py --jobs 2
+	$(BIN)/python -m benchmarks.paper.tables --jobs 2
 
 figures: $(VENV)/.installed  ## the pictures of the documentation
-	$(BIN)/python benchmarks/figures.py
+	$(BIN)/python -m benchmarks.figures
 
 clean:  ## remove the environment, caches and runs
 	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*

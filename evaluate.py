@@ -15,14 +15,16 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from jaxreg import io, scoring
-from jaxreg.compilation import enable_compilation_cache
+from jaxreg import io
+from jaxreg.cli.options import parse, stop, told
+from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import Config
 from jaxreg.data import root_of
-from jaxreg.options import parse, stop, told
-from jaxreg.report import results_table
+from jaxreg.evaluation import score
+from jaxreg.evaluation.table import results_table
+from jaxreg.view import pictures
 
-_METHODS = ("checkpoint", "predecessor", "method", "transforms")
+_METHODS = ("checkpoint", "rienet", "method", "transforms")
 _CHOICE = (*_METHODS, "refine", "pairs", "batch")
 _SUFFIXES = {
     "json": (),
@@ -42,10 +44,10 @@ class Options:
     checkpoint: str = ""
     """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations and
     n_inliers of the run unless the command line gives others."""
-    predecessor: str = ""
-    """NPZ file with the released weights of the predecessor, RIENet (not ours to ship)."""
+    rienet: str = ""
+    """NPZ file with RIENet's released weights (not ours to ship)."""
     method: str = ""
-    """Another method: register, register_dense, register_dense_learned, icp or identity; or a baseline
+    """Another method: register, register_global, register_global_learned, icp, identity, or a baseline
     such as open3d_fgr (a wrong name lists the baselines)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
@@ -77,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
         config = _evaluated_config(options, path, _given(arguments[1:]))
         root = root_of(config.data, options.data_root, path)
         chosen = {name: getattr(options, name) for name in _CHOICE}
-        scored = scoring.evaluate(config, root=root, **chosen)
+        scored = score.evaluate(config, root=root, **chosen)
         # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
         try:
             _report(options, path, scored)
@@ -96,7 +98,7 @@ def _check(options: Options, path: Path) -> None:
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
             "--batch 1 or more."
         )
-    taken = [path, *(Path(p) for p in (options.transforms, options.predecessor) if p)]
+    taken = [path, *(Path(p) for p in (options.transforms, options.rienet) if p)]
     for name, suffixes in _SUFFIXES.items():
         if getattr(options, name):
             output = Path(getattr(options, name))
@@ -131,7 +133,7 @@ def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Co
     config = options.config
     if not options.checkpoint:
         return config
-    model = dataclasses.asdict(scoring.trained_config(config, checkpoint=options.checkpoint).model)
+    model = dataclasses.asdict(score.trained_config(config, checkpoint=options.checkpoint).model)
     changed = {}
     for name in ("iterations", "n_inliers"):
         value = getattr(config.model, name)
@@ -162,12 +164,10 @@ def _no_effect(name: str, option: str, options: Options) -> str:
         return ""
     if chosen in ("--method", "--transforms"):
         return f"{chosen} evaluates no network; leave it out"
-    if field in scoring.AFTER_TRAINING or not (chosen or config.weights):
+    if field in score.AFTER_TRAINING or not (chosen or config.weights):
         return ""
     field = field.removeprefix("no_")
-    trained = scoring.trained_config(
-        config, checkpoint=options.checkpoint, predecessor=options.predecessor
-    )
+    trained = score.trained_config(config, checkpoint=options.checkpoint, rienet=options.rienet)
     value = getattr(trained.model, field)
     if value == getattr(config.model, field):
         return ""
@@ -177,21 +177,21 @@ def _no_effect(name: str, option: str, options: Options) -> str:
     )
 
 
-def _report(options: Options, path: Path, scored: scoring.Scored) -> None:
-    result = scoring.figures(scored) | {"config": path.stem}
+def _report(options: Options, path: Path, scored: score.Scored) -> None:
+    result = score.figures(scored) | {"config": path.stem}
     Console().print(results_table([result], title=str(path)))
     if options.json:
         Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def _write(options: Options, config: Config, root: Path | None, scored: scoring.Scored) -> None:
+def _write(options: Options, config: Config, root: Path | None, scored: score.Scored) -> None:
     if options.save_transforms:
-        scoring.save_transforms(options.save_transforms, scored.predicted)
+        score.save_transforms(options.save_transforms, scored.predicted)
     if options.save_pairs:
-        _, batches = scoring.pair_stream(config, root=root, pairs=options.pairs)
-        scoring.save_pairs(options.save_pairs, batches)
+        _, batches = score.pair_stream(config, root=root, pairs=options.pairs)
+        score.save_pairs(options.save_pairs, batches)
     if options.picture:
-        scoring.draw_first_pair(options.picture, scored)
+        pictures.draw_first_pair(options.picture, scored)
 
 
 if __name__ == "__main__":

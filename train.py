@@ -11,13 +11,13 @@ from typing import Annotated
 
 import tyro
 
-from jaxreg.compilation import enable_compilation_cache, restart_with_huge_pages
+from jaxreg.cli.options import parse, stop, told
+from jaxreg.cli.process import enable_compilation_cache, restart_with_huge_pages
 from jaxreg.config import Config
 from jaxreg.data import root_of
-from jaxreg.options import parse, stop, told
-from jaxreg.pictures import plot_curves
-from jaxreg.pretrained import check_new_name
 from jaxreg.training import release, train
+from jaxreg.view.pictures import plot_curves
+from jaxreg.weights.released import check_new_name
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Every picture of the documentation, from procedural shapes and the released weights.
 
-    python benchmarks/figures.py [--folder docs/images] [--only pairs noise matches arccos]
-    python benchmarks/figures.py --only drift --runs runs/drift_default runs/drift_batch4 ...
+    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos]
+    python -m benchmarks.figures --only drift --runs runs/drift_default runs/drift_batch4 ...
 
 `pairs` and `noise`: pairs before and after, with the inlier confidence as colour. `matches`: the
 best match of points at the first step with the 1-NN cloud, with every point in the place of its own
@@ -23,15 +23,20 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from jaxreg import evaluation, metrics, pictures
-from jaxreg.compilation import enable_compilation_cache, jit
+from jaxreg._xla import jit
+from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import ModelConfig, PairConfig
-from jaxreg.data import shapes
+from jaxreg.data.batches import pair_batches, test_key
 from jaxreg.data.pairs import make_pair
-from jaxreg.matching import feature_distance, matching_maps, neighborhood_sum
-from jaxreg.model import iterate, neighborhood_graph, point_features
-from jaxreg.pretrained import load_pretrained
+from jaxreg.data.procedural import shapes
+from jaxreg.evaluation import methods, metrics, run
+from jaxreg.geometry import rigid
+from jaxreg.network.matching import feature_distance, matching_maps, neighborhood_sum
+from jaxreg.network.model import iterate, neighborhood_graph, point_features
 from jaxreg.types import Pair
+from jaxreg.view import pictures
+from jaxreg.weights import checkpoint
+from jaxreg.weights.released import load_pretrained
 
 CLEAN = PairConfig(points=1024, kept=768)
 NOISY = dataclasses.replace(CLEAN, outliers=200)
@@ -79,7 +84,7 @@ def register(pairs: list[Pair], weights: str, model: ModelConfig | None = None) 
             np.asarray, one(pair.source, pair.reference)
         )
         pair = jax.tree.map(np.asarray, pair)
-        error = metrics.rotation_angle_deg(rotation[None], pair.transform.rotation[None])[0]
+        error = rigid.rotation_angle_deg(rotation[None], pair.transform.rotation[None])[0]
         aligned = pair.source.points @ rotation.T + translation
         done.append(Registered(pair, aligned, confidence[-1], float(error)))
     return done
@@ -183,11 +188,9 @@ def draw_arccos(options: Options, path: Path, count: int = 128) -> None:
     clouds = np.stack(
         [shapes.sample_shape(options.seed, FIRST + i, points=1024) for i in range(count)]
     )
-    batches = evaluation.pair_batches(
-        clouds, evaluation.test_key(options.seed), config=CLEAN, batch=8
-    )
-    method = evaluation.network_method(variables, config.model)
-    predicted, truth, _ = evaluation.evaluate_method(method, batches)
+    batches = pair_batches(clouds, test_key(options.seed), config=CLEAN, batch=8)
+    method = methods.network_method(variables, config.model)
+    predicted, truth, _ = run.evaluate_method(method, batches)
     errors = metrics.pair_errors(predicted, truth)
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -217,9 +220,9 @@ def draw_drift(options: Options, path: Path) -> None:
     """Training loss and validation error over the steps, a line a run."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for run in options.runs:
-        columns = pictures.read_metrics(Path(run) / "metrics.jsonl")
-        label, error = Path(run).name, columns["val_mie_r_deg"]
+    for folder in options.runs:
+        columns = checkpoint.read_metrics(Path(folder) / "metrics.jsonl")
+        label, error = Path(folder).name, columns["val_mie_r_deg"]
         smooth = np.convolve(columns["loss"], np.ones(25) / 25, mode="valid")
         left.plot(columns["step"][12 : 12 + len(smooth)], smooth, label=label, lw=1)
         known = np.isfinite(error)

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxreg.refine.icp import icp
-from jaxreg.rigid import apply
+from jaxreg.geometry.rigid import apply
+from jaxreg.refine.point_to_point import icp
 
 TRUE_OFFSET = 0.08  # metres
 STEPS = 8

@@ -7,16 +7,16 @@ import importlib
 from typing import TYPE_CHECKING
 
 from jaxreg.config import Config, load_config
-from jaxreg.neighbors import knn, nearest_neighbor
-from jaxreg.numerics import included_angle
-from jaxreg.procrustes import weighted_procrustes
-from jaxreg.register import ScanRegistration, register
-from jaxreg.rigid import apply, compose, from_matrix, identity, inverse, to_matrix
+from jaxreg.geometry.neighbors import knn, nearest_neighbor
+from jaxreg.geometry.numerics import included_angle
+from jaxreg.geometry.procrustes import weighted_procrustes
+from jaxreg.geometry.rigid import apply, compose, from_matrix, identity, inverse, to_matrix
+from jaxreg.scans.pair import ScanRegistration, register
 from jaxreg.types import Pair, PointCloud, Registration, RigidTransform
 
 if TYPE_CHECKING:
-    from jaxreg.model import init_variables, register_pair
-    from jaxreg.pretrained import available_weights, load_pretrained
+    from jaxreg.network.model import init_variables, register_pair
+    from jaxreg.weights.released import available_weights, load_pretrained
 
 __version__ = "0.1.0"
 
@@ -47,10 +47,10 @@ __all__ = [
 
 # Flax takes 0.2 s to import: two scans are registered without it, so these wait until they are used.
 _WITH_FLAX = {
-    "available_weights": "jaxreg.pretrained",
-    "init_variables": "jaxreg.model",
-    "load_pretrained": "jaxreg.pretrained",
-    "register_pair": "jaxreg.model",
+    "available_weights": "jaxreg.weights.released",
+    "init_variables": "jaxreg.network.model",
+    "load_pretrained": "jaxreg.weights.released",
+    "register_pair": "jaxreg.network.model",
 }
 
 

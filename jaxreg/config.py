@@ -12,7 +12,6 @@ documentation of each field.
 
 import dataclasses
 import difflib
-import math
 import tomllib
 import typing
 from pathlib import Path
@@ -28,7 +27,7 @@ class ModelConfig:
     k_matching: int = 5
     """K of the neighbourhood sum in Eq. 4."""
     include_self: bool = False
-    """Put the point itself in front of its K neighbours (the predecessor does)."""
+    """Put the point itself in front of its K neighbours (RIENet does)."""
     channels: tuple[int, ...] = (32, 32, 64, 128)
     """Widths of the DGCNN layers."""
     width: int = 256
@@ -38,21 +37,21 @@ class ModelConfig:
     one_nn: Literal["gather", "own", "self", "none"] = "gather"
     """1-NN patch. `gather`: features of the 1-NN cloud are those of the same points in the input
     cloud. `own`: graph and features are computed in the 1-NN cloud itself. `self`: every point is its
-    own 1-NN (control). `none`: single neighbourhood (the predecessor)."""
+    own 1-NN (control). `none`: single neighbourhood (RIENet)."""
     edge: Literal["vector", "length", "coordinates"] = "vector"
     """e of Eq. 7: the edge vector, its length (invariant to rotation), or the raw neighbour
     coordinates (the paper's ablation without geometric invariants)."""
     angles: Literal["all", "next", "none"] = "next"
     """Pairs (r, s) of the angles in Eq. 7: to every other edge, to the next edge, or no angle. The
     paper does not say which; `next` withstood outliers better with every seed (RESULTS.md)."""
-    inlier_network: Literal["paper", "predecessor"] = "paper"
-    """Eq. 9-11 as written, or the predecessor's convolution along the ordered neighbours."""
+    inlier_network: Literal["paper", "rienet"] = "paper"
+    """Eq. 9-11 as written, or RIENet's convolution along the ordered neighbours."""
     inlier_width: int = 8
     """Width of the inlier networks' first layer; the second is twice as wide."""
     n_inliers: int = 256
     """N_c, correspondences kept by confidence (Eq. 12)."""
     svd: Literal["top", "all"] = "top"
-    """Points of the weighted Procrustes: the top N_c (paper) or all of them (predecessor)."""
+    """Points of the weighted Procrustes: the top N_c (paper) or all of them (RIENet)."""
     robust_rounds: int = 0
     """Times that each weighted Procrustes is solved again with less weight on the pairs it cannot
     explain (0 in the paper). Meant for inference."""
@@ -162,7 +161,7 @@ class TrainConfig:
     warmup: int = 100
     """Steps of warm-up."""
     weight_decay: float = 1e-4
-    """L2 term inside Adam (the predecessor's)."""
+    """L2 term inside Adam (RIENet's)."""
     clip: float = 1000.0
     """Largest global norm of the gradient."""
     ema: float = 0.99
@@ -173,154 +172,6 @@ class TrainConfig:
     """Pairs of a validation."""
     seed: int = 0
     """The one seed; everything random derives from it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RefineConfig:
-    """Refinement of a pose by the ICP family."""
-
-    method: Literal["icp", "point_to_plane", "gicp"] = "gicp"
-    """Point to point, point to plane, or generalised (plane to plane)."""
-    iterations: int = 30
-    """Iterations, each with fresh correspondences."""
-    max_distance: float = math.inf
-    """Pairs farther apart than this (unit of the clouds) do not count."""
-    trim: float = 1.0
-    """Share of the closest pairs that count."""
-    kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "geman_mcclure"
-    """Robust weight of the pairs. (The function `icp` alone is plain unless told.)"""
-    anneal: float = 10.0
-    """How many times wider the kernel is in the first iteration than in the last."""
-    both_directions: bool = False
-    """Also pair every reference point with its nearest source point."""
-    neighbors: int = 10
-    """Neighbours of a point that its normal is computed from."""
-    thickness: float = 1e-3
-    """Variance across a surface, in units of the variance along it (generalised ICP)."""
-    edges: bool = False
-    """Surfaces end: their edges must meet, too (generalised ICP)."""
-    weak_threshold: float = 0.01
-    """A motion is weak when it changes the distances to the surfaces by a smaller mean square than
-    this, for a motion of one (1/3 for surfaces that face all ways)."""
-    dense_limit: int = 1024
-    """Largest cloud, in points, whose pairs are found by brute force; above, by a tree on the host."""
-    tolerance: float = 1e-5
-    """The host stops when a step turns by less (radians) and moves by less (in radii of the cloud)."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RegisterConfig:
-    """Registration of two scans on the host (`jaxreg.register`)."""
-
-    search_points: int = 1024
-    """Most points of a cloud in the search for a pose; larger clouds are averaged in voxels."""
-    learned: bool = False
-    """Match points by learned features in place of the moments that these read: more true matches,
-    and a few crops more of a hundred, for a quarter more of the time."""
-    limited_deg: float = 80.0
-    """Largest rotation between two clouds that `rotation = "limited"` looks for."""
-    reach: float = 1.5
-    """A point agrees with the other cloud when it is within this many spacings of it (those of the
-    clouds reduced to `search_points`)."""
-    refine_points: int = 4096
-    """Most points of a cloud in the refinement."""
-    refine_iterations: int = 10
-    """Most iterations of the refinement."""
-    refine_anneal: float = 8.0
-    """How many times wider its kernel is in the first iteration than in the last."""
-    refine_neighbors: int = 16
-    """Neighbours of a point that its normal is computed from."""
-    refine_thickness: float = 0.01
-    """Variance across a surface, in units of the variance along it."""
-    refine_reach: float = 2.0
-    """Largest distance of its pairs, in spacings of the clouds that it has."""
-    refine_edges: bool = True
-    """Surfaces end, and where both do their edges must meet."""
-
-
-@dataclasses.dataclass(frozen=True)
-class DenseConfig:
-    """Global registration of clouds that share no point (`jaxreg.dense`).
-
-    Lengths are in units in which a usual shape fills the unit sphere, angles in radians.
-    """
-
-    unit: float = 0.0
-    """That unit, in the unit of the clouds. 0: twice the clouds' root mean square radius."""
-    radii: tuple[float, ...] = (0.2, 0.4, 0.8)
-    """Radii of the moment descriptors."""
-    normal_radius: float = 0.15
-    """Radius of the Gaussian neighbourhood of a normal."""
-    matches: int = 3
-    """Most similar points of every point that become candidates, in both directions."""
-    candidates: int = 768
-    """Candidates kept, the clearest first."""
-    seeds: int = 512
-    """Of these the first ones, which give a pose each."""
-    partners: int = 12
-    """Other candidates that a pose is computed from."""
-    tolerance: float = 0.08
-    """Change of a distance at which two candidates stop being compatible."""
-    normal_tolerance: float = 0.3
-    """The same for the cosines of normals and lines."""
-    grid_cells: int = 24
-    """Cells of the nearest-point grid along each axis."""
-    screen_width: float = 0.06
-    """Width of the Gaussian overlap that all poses are screened by."""
-    screened: int = 64
-    """Distinct poses that are aligned coarsely."""
-    distinct_angle: float = 0.26
-    """Poses are distinct when they turn by more than this from each other,"""
-    distinct_distance: float = 0.15
-    """or move the centroid of the source farther apart than this."""
-    aligned: int = 8
-    """Poses that are aligned and ranked with all their neighbours afterwards,"""
-    aligned_angle: float = 0.1
-    """distinct by this angle"""
-    aligned_distance: float = 0.05
-    """or this distance."""
-    coarse_step: int = 2
-    """Every so-manieth point is screened and refined coarsely."""
-    coarse_widths: tuple[float, ...] = (0.15, 0.12, 0.09, 0.07, 0.05)
-    """Gaussian width of every coarse iteration."""
-    coarse_thickness: float = 0.1
-    """Weight of the distance along a surface, against that across it, in these."""
-    fine_widths: tuple[float, ...] = (0.1, 0.07, 0.05, 0.05)
-    """Gaussian width of every fine iteration."""
-    thickness: float = 0.01
-    """Variance across a surface, in units of the variance along it."""
-    final_iterations: int = 15
-    """Iterations of generalised ICP on the best pose,"""
-    final_reach: float = 0.06
-    """the largest distance of its pairs,"""
-    final_partners: int = 2
-    """the points that every point is paired with,"""
-    final_anneal: float = 8.0
-    """how many times wider its kernel is in the first iteration than in the last,"""
-    final_neighbors: int = 16
-    """and the neighbours of a point that its normal is computed from."""
-    match_width: float = 0.05
-    """Width of the distance at which points count as near, in the ranking."""
-    plane_width: float = 0.02
-    """Width of the distance from the other surface's plane at which they match."""
-    dense_spacing: float = 0.035
-    """Mean distance to the nearest point above which both of these widths, and the reach of the last
-    refinement, grow in proportion."""
-    rim_radius: float = 0.3
-    """Radius at which a surface is seen to be open."""
-    rim: float = 0.25
-    """Openness at which a surface counts as ending."""
-    alike: float = 0.33
-    """Worth of a near point around which the surfaces look alike, in points that match. This and the
-    two below were fitted to rank 32 poses of pairs of procedural shapes (crops of 70 and 50 %)."""
-    within: float = 1.8
-    """Cost of a near point away from all rims: it should match, not only be near."""
-    beside: float = 4.1
-    """Cost of a point that lies beside the inside of the other surface."""
-    doubt: float = 0.03
-    """Poses whose plausibility is less than this below the best one's are a close call,"""
-    flush: float = 0.25
-    """in which a point that lies flush with the other surface is worth this much more."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,19 +17,22 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from jaxreg import checkpoint, report, rigid
-from jaxreg.compilation import jit
-from jaxreg.config import Config, PairConfig, TrainConfig
+from jaxreg._xla import jit
+from jaxreg.config import Config, TrainConfig
 from jaxreg.data import load_shapes, training_label
-from jaxreg.data.pairs import make_pair
-from jaxreg.evaluation import evaluate_method, network_method, pair_batches, validation_key
-from jaxreg.features import BATCH_AXIS
-from jaxreg.losses import pose_error, step_losses, total_loss
-from jaxreg.metrics import evaluate_transforms
-from jaxreg.model import Variables, init_variables, iterate
-from jaxreg.pictures import read_metrics
-from jaxreg.pretrained import check_new_name, save_weights
+from jaxreg.data.batches import pair_batches, validation_key
+from jaxreg.data.pairs import make_pair, shape_points
+from jaxreg.evaluation.methods import network_method
+from jaxreg.evaluation.metrics import evaluate_transforms
+from jaxreg.evaluation.run import evaluate_method
+from jaxreg.geometry import rigid
+from jaxreg.network.features import BATCH_AXIS
+from jaxreg.network.losses import pose_error, step_losses, total_loss
+from jaxreg.network.model import Variables, init_variables, iterate
+from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
+from jaxreg.weights import checkpoint
+from jaxreg.weights.released import check_new_name, save_weights
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
 
@@ -192,7 +195,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     on_device = jnp.asarray(shapes)
     with (
         checkpoint.open_run(workdir, config) as run,
-        report.training_progress(config.train.steps) as progress,
+        training_progress(config.train.steps) as progress,
     ):
         state = run.restore(create_train_state(config))
         while int(state.step) < config.train.steps:
@@ -213,7 +216,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
                 run.save(number, state, entry["val_mie_r_deg"])
             run.log(entry)
             progress(entry)
-    return load_checkpoint(workdir)[0]
+    return checkpoint.load_checkpoint(workdir)[0]
 
 
 _LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
@@ -236,25 +239,6 @@ def _check_options(config: TrainConfig) -> None:
         )
 
 
-def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
-    """The best (averaged) variables of a run, and its configuration; the run is only read.
-
-    Raises:
-      ValueError: there is no checkpoint in `workdir`, or it holds other arrays than a network of
-        this version, or it cannot be read.
-    """
-    return _load_best(workdir)[:2]
-
-
-def _load_best(workdir: str | Path) -> tuple[Variables, Config, int]:
-    """The same, and the step. Nothing of the optimiser is read, which other versions may change."""
-    config, _ = checkpoint.best_config(workdir)
-    average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config.model))
-    step = jax.ShapeDtypeStruct((), jnp.int32)
-    best = checkpoint.restore_best(workdir, {"step": step, "average": average})
-    return jax.tree.map(jnp.asarray, best["average"]), config, int(best["step"])
-
-
 def release(
     name: str, workdir: str | Path, command: str, *, root: str | Path | None = None
 ) -> None:
@@ -267,9 +251,9 @@ def release(
         lacks the step of the best one.
     """
     check_new_name(name)
-    variables, config, step = _load_best(workdir)
+    variables, config, step = checkpoint.load_best(workdir)
     log = Path(workdir) / "metrics.jsonl"
-    metrics = read_metrics(log)
+    metrics = checkpoint.read_metrics(log)
     rows = np.flatnonzero(metrics["step"] == step)
     if len(rows) == 0:
         # A run that is killed between the two has saved the step and not logged it.
@@ -289,8 +273,3 @@ def release(
         },
     }
     save_weights(Path(__file__).parent / "weights", name, variables, config, card)
-
-
-def shape_points(pairs: PairConfig) -> int:
-    """Points that a shape must have, where its source can choose."""
-    return (2 if pairs.sampling == "disjoint" else 1) * pairs.points

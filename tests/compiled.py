@@ -6,13 +6,13 @@ third of the time of the suite. That jit equals eager is a test of its own (test
 
 import jax
 
-from jaxreg import neighbors
-from jaxreg.dense import moments
+from jaxreg.geometry import neighbors
+from jaxreg.geometry import normals as _normals
+from jaxreg.refine import correspondences
 from jaxreg.refine import gicp as _gicp
-from jaxreg.refine import icp as _icp
-from jaxreg.refine import normals as _normals
-from jaxreg.refine import pairing
 from jaxreg.refine import point_to_plane as _point_to_plane
+from jaxreg.refine import point_to_point as _icp
+from jaxreg.search import descriptors
 
 AS_USERS = {"xla_backend_optimization_level": 3}
 """Options with which XLA compiles as in a user's process, not as tests/conftest.py has it."""
@@ -22,7 +22,7 @@ if jax.__version_info__ < (0, 11):
 _SOLVER = ("iterations", "kernel", "trim", "anneal", "both_directions")
 
 knn = jax.jit(neighbors.knn, static_argnums=1)
-closest_pairs = jax.jit(pairing.closest_pairs, static_argnames="both_directions")
+closest_pairs = jax.jit(correspondences.closest_pairs, static_argnames="both_directions")
 normals = jax.jit(_normals.normals)
 edge_normals = jax.jit(_normals.edge_normals)
 neighborhood_covariances = jax.jit(_normals.neighborhood_covariances)
@@ -31,6 +31,8 @@ point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames=(*_SOLV
 gicp = jax.jit(
     _gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness", "partners", "edges")
 )
-moment_descriptors = jax.jit(moments.moment_descriptors, static_argnames=("radii", "normal_radius"))
-standardized = jax.jit(moments.standardized)
-openness = jax.jit(moments.openness, static_argnames="radius")
+moment_descriptors = jax.jit(
+    descriptors.moment_descriptors, static_argnames=("radii", "normal_radius")
+)
+standardized = jax.jit(descriptors.standardized)
+openness = jax.jit(descriptors.openness, static_argnames="radius")

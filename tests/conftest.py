@@ -98,7 +98,7 @@ def pytest_runtest_setup(item):
     if item.get_closest_marker("modelnet") and not _modelnet():
         pytest.skip("no ModelNet40: set JAXREG_DATA to the folder that holds modelnet40_ply_hdf5_*")
     if item.get_closest_marker("peers") and not _peers().is_dir():
-        pytest.skip("no folder `peers` beside $JAXREG_DATA with the predecessor's released weights")
+        pytest.skip("no folder `peers` beside $JAXREG_DATA with RIENet's released weights")
 
 
 def _data() -> Path | None:
@@ -148,7 +148,7 @@ def data_root() -> Path:
 
 @pytest.fixture(scope="session")
 def peers_root() -> Path:
-    """The folder of the predecessor's released weights; skips the test where there is none."""
+    """The folder of RIENet's released weights; skips the test where there is none."""
     if not _peers().is_dir():
-        pytest.skip("no folder `peers` beside $JAXREG_DATA with the predecessor's released weights")
+        pytest.skip("no folder `peers` beside $JAXREG_DATA with RIENet's released weights")
     return _peers()

@@ -43,7 +43,7 @@ def killer(mutant: Mutant, cache: str) -> str | None:
     """
 
     def mutate(copy: Path) -> None:
-        path = copy / "jaxreg" / f"{mutant.module}.py"
+        path = copy / file_of(mutant)
         source = path.read_text(encoding="utf-8")
         if source.count(mutant.text) != 1:
             count = source.count(mutant.text)
@@ -54,7 +54,12 @@ def killer(mutant: Mutant, cache: str) -> str | None:
 
 
 def test_of(mutant: Mutant) -> str:
-    return f"tests/test_{mutant.module}.py::{mutant.test}"
+    package, _, name = mutant.module.rpartition(".")
+    return str(Path("tests", *package.split("."), f"test_{name}.py")) + f"::{mutant.test}"
+
+
+def file_of(mutant: Mutant) -> Path:
+    return Path("jaxreg", *mutant.module.split(".")).with_suffix(".py")
 
 
 def first_failure(

@@ -14,11 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import transcription
-from jaxreg import evaluation, inliers, matching, neighbors, scans, training
-from jaxreg.compilation import jit
+from benchmarks.paper import transcription
+from jaxreg import training
+from jaxreg._xla import jit
 from jaxreg.config import from_dict
-from jaxreg.model import init_variables, register_pair
+from jaxreg.evaluation import methods
+from jaxreg.geometry import clouds, neighbors
+from jaxreg.network import inliers, matching
+from jaxreg.network.model import init_variables, register_pair
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from tests.compiled import AS_USERS
 
@@ -106,7 +109,7 @@ def evaluated() -> str:
     variables = jax.eval_shape(lambda: init_variables(jax.random.key(0), CONFIG.model))
     clouds = (PointCloud(array(BATCH, n, 3), array(BATCH, n, dtype=bool)) for n in (N, M))
     pair = Pair(*clouds, RigidTransform(array(BATCH, 3, 3), array(BATCH, 3)))
-    run = functools.partial(evaluation._register_batch, config=CONFIG.model, padded=True)
+    run = functools.partial(methods._register_batch, config=CONFIG.model, padded=True)
     return compiled(jit(run), variables, pair)
 
 
@@ -232,7 +235,7 @@ def test_ten_sizes_in_one_bucket_compile_once(caplog, seed):
     def compilations(size):
         clouds, masks = zip(
             *(
-                scans.padded(rng.normal(size=(n, 3)), scans.bucket(n, smallest=256, largest=1024))
+                clouds.padded(rng.normal(size=(n, 3)), clouds.bucket(n, smallest=256, largest=1024))
                 for n in (size, size - 3)
             ),
             strict=True,

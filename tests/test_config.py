@@ -8,7 +8,7 @@ import pytest
 
 from jaxreg.config import Config, ModelConfig, from_dict, load_config, to_dict
 from jaxreg.data import pair_sizes
-from jaxreg.pretrained import available_weights
+from jaxreg.weights.released import available_weights
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 

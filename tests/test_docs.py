@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxreg import cli, compilation
+from jaxreg.cli import commands, process
 from jaxreg.config import load_config
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -54,7 +54,7 @@ def run_shell(code: str) -> str | None:
             if line == "echo $?":
                 print(status)
             else:
-                status = cli.main(shlex.split(line)[1:])
+                status = commands.main(shlex.split(line)[1:])
     return printed.getvalue()
 
 
@@ -93,7 +93,7 @@ def forms(text: str) -> set[str]:
 def folder(tmp_path, monkeypatch):
     """An empty folder to run in, and no compilation cache."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compilation, "enable_compilation_cache", lambda **_: None)
+    monkeypatch.setattr(process, "enable_compilation_cache", lambda **_: None)
     return tmp_path
 
 
@@ -166,7 +166,7 @@ def write_pages() -> None:
     """
     import tempfile
 
-    compilation.enable_compilation_cache(least_seconds=0.0)
+    process.enable_compilation_cache(least_seconds=0.0)
     for path in PAGES.values():
         text, pieces, end = path.read_text(encoding="utf-8"), [], 0
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

@@ -7,7 +7,7 @@ from tests import mutants
 
 @pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda m: f"{m.module}: {m.text}")
 def test_text_stands_once_and_the_test_exists(mutant):
-    module = (mutants.ROOT / "jaxreg" / f"{mutant.module}.py").read_text(encoding="utf-8")
+    module = (mutants.ROOT / mutants.file_of(mutant)).read_text(encoding="utf-8")
     assert module.count(mutant.text) == 1
     path, _, name = mutants.test_of(mutant).partition("::")
     tests = (mutants.ROOT / path).read_text(encoding="utf-8")

@@ -35,8 +35,8 @@ def test_the_list_is_of_modules_that_exist_here():
     ("code", "unneeded"),
     [
         ("import jaxreg", HEAVY | SCIPY | {"flax", "tyro", "rich.progress"}),
-        ("import jaxreg.cli, jaxreg.register", HEAVY | SCIPY | {"flax"}),
-        ("import jaxreg.io, jaxreg.summary, jaxreg.viewer", (HEAVY - {"plyfile"}) | SCIPY),
+        ("import jaxreg.cli, jaxreg.scans.pair", HEAVY | SCIPY | {"flax"}),
+        ("import jaxreg.io, jaxreg.scans.summary, jaxreg.view.page", (HEAVY - {"plyfile"}) | SCIPY),
     ],
 )
 def test_start_is_lean(code, unneeded):
@@ -64,7 +64,7 @@ def test_every_public_name_is_there_and_no_other():
 )
 def test_a_restart_for_huge_pages_keeps_settings_and_arguments(given, expected):
     program = (
-        "import os, sys; from jaxreg.compilation import restart_with_huge_pages\n"
+        "import os, sys; from jaxreg.cli.process import restart_with_huge_pages\n"
         "restart_with_huge_pages(); print(os.environ['GLIBC_TUNABLES'], sys.argv[1:])"
     )
     done = subprocess.run(

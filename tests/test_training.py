@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 
 import train as script
-from jaxreg import checkpoint, training
+from jaxreg import training
 from jaxreg.config import Config, DataConfig, TrainConfig, from_dict
 from jaxreg.data import training_label
 from jaxreg.types import RigidTransform
+from jaxreg.weights import checkpoint
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
 
@@ -123,7 +124,7 @@ def test_a_resumed_run_equals_an_unbroken_one(config, tmp_path, monkeypatch):
     ]
     assert [entry["step"] for entry in lines[1]] == [1, 2, 3, 4]
     assert lines[0] == lines[1]
-    variables, saved = training.load_checkpoint(tmp_path / "broken")
+    variables, saved = checkpoint.load_checkpoint(tmp_path / "broken")
     jax.tree.map(np.testing.assert_array_equal, variables, resumed)
     assert saved == config
 
@@ -164,14 +165,14 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(config, tmp_path
 
 def test_no_checkpoint_is_an_error_that_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match="--workdir"):
-        training.load_checkpoint(tmp_path)
+        checkpoint.load_checkpoint(tmp_path)
 
 
 def test_a_checkpoint_with_other_arrays_is_an_error_that_says_so(config, tmp_path):
     with checkpoint.open_run(tmp_path, config) as run:
         run.save(1, {"weights": jnp.zeros(3)}, error=1.0)
     with pytest.raises(ValueError, match="other arrays than this version"):
-        training.load_checkpoint(tmp_path)
+        checkpoint.load_checkpoint(tmp_path)
 
 
 def entries(workdir) -> list[dict]:
@@ -293,7 +294,7 @@ def test_a_run_of_another_optimiser_is_evaluated_and_only_read(config, tmp_path)
         run.save(3, changed, error=1.0)
     shutil.rmtree(tmp_path / "latest")
     files = sorted(tmp_path.rglob("*"))
-    variables, saved = training.load_checkpoint(tmp_path)
+    variables, saved = checkpoint.load_checkpoint(tmp_path)
     jax.tree.map(np.testing.assert_array_equal, variables, state.average)
     assert saved == config
     assert sorted(tmp_path.rglob("*")) == files
@@ -319,7 +320,7 @@ def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
             path.write_bytes(b"")
     # In a process of its own: reads that are still under way fail later, in threads, and pytest would
     # blame whatever test runs by then.
-    code = f"from jaxreg import training; training.load_checkpoint({str(tmp_path)!r})"
+    code = f"from jaxreg import training; checkpoint.load_checkpoint({str(tmp_path)!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert re.search(r"ValueError: .*best cannot be read \(.*\): put a whole copy", done.stderr)

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 
 from jaxreg.config import DataConfig
-from jaxreg.data import folder, icl_nuim, modelnet, seven_scenes, shapes
+from jaxreg.data import folder, icl_nuim, modelnet, seven_scenes
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
+from jaxreg.data.procedural import shapes
 
 __all__ = [
     "Split",

@@ -9,7 +9,7 @@ _FAR = 500.0  # Each coordinate of the viewpoint, up to U[0, 1] and one sign for
 
 
 def viewpoint(key: PRNGKeyArray) -> Float[Array, "3"]:
-    """``+-(500, 500, 500) + U[0, 1]^3`` (the crop of the predecessor's code)."""
+    """``+-(500, 500, 500) + U[0, 1]^3`` (the crop of RIENet's code)."""
     *offset, coin = jax.random.uniform(key, (4,), jnp.float32)
     return jnp.where(coin < 0.5, -_FAR, _FAR) + jnp.stack(offset)
 

@@ -13,10 +13,10 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxreg import rigid
 from jaxreg.config import PairConfig
 from jaxreg.data import crops
-from jaxreg.neighbors import without_padding
+from jaxreg.geometry import rigid
+from jaxreg.geometry.neighbors import without_padding
 from jaxreg.types import Pair, PointCloud, RigidTransform
 
 _OUTLIER_STD, _OUTLIER_CLIP = 0.5, 1.0
@@ -247,3 +247,8 @@ def _shuffled(key: PRNGKeyArray, mask: Bool[Array, "n"]) -> Int[Array, "n"]:
 
 def _take(cloud: PointCloud, index: Int[Array, "m"]) -> PointCloud:
     return PointCloud(cloud.points[index], cloud.mask[index])
+
+
+def shape_points(pairs: PairConfig) -> int:
+    """Points that a shape must have, where its source can choose."""
+    return (2 if pairs.sampling == "disjoint" else 1) * pairs.points

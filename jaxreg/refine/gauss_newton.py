@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
-from jaxreg.numerics import safe_norm
+from jaxreg.geometry.numerics import safe_norm
 from jaxreg.types import RigidTransform
 
 _DAMPING = 1e-5

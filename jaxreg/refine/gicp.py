@@ -5,22 +5,13 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
-from jaxreg import rigid, symmetric
-from jaxreg.config import RefineConfig
-from jaxreg.neighbors import knn
-from jaxreg.refine import frame
+from jaxreg.geometry import eigen3x3, frame, rigid
+from jaxreg.geometry.neighbors import knn
+from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
+from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.correspondences import Pairs, closest_pairs, with_neighbors
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import edge_normals, normals, surface_covariances
-from jaxreg.refine.pairing import (
-    Kernel,
-    Pairs,
-    Weighting,
-    check_options,
-    closest_pairs,
-    pair_weights,
-    widenings,
-    with_neighbors,
-)
+from jaxreg.refine.robust import Kernel, Weighting, check_options, pair_weights, widenings
 from jaxreg.types import RigidTransform
 
 _DEFAULT = RefineConfig()
@@ -57,7 +48,7 @@ def gicp(
     `neighbors` neighbours; with `edges`, of surfaces that end (`normals.edge_normals`).
     `kernel` weighs ``sqrt(r^T M r)``. With more than one of `partners`, a
     point is also paired with the nearest neighbours of its partner, which averages the noise of
-    their planes. Everything else is as for `jaxreg.refine.icp.icp`.
+    their planes. Everything else is as for `icp`.
 
     Raises:
       ValueError: a shape or an option is wrong, or a cloud whose neighbours are needed has not more
@@ -132,7 +123,7 @@ def gicp_step(
     # Padding may hold NaN covariances; its pairs count for nothing.
     identity = jnp.eye(3, dtype=combined.dtype)[None]
     combined = jnp.where(pairs.mask[:, None, None], combined, identity)
-    metric = 2 * thickness * symmetric.inverse(combined)
+    metric = 2 * thickness * eigen3x3.inverse(combined)
     residual = moved - target
     energy = jnp.sum(residual * jnp.matmul(metric, residual[..., None])[..., 0], axis=-1)
     distance = jnp.sum(residual**2, axis=-1)

@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg import scans
-from jaxreg.config import RefineConfig
-from jaxreg.refine.frame import Frame
+from jaxreg.geometry import frame
+from jaxreg.geometry.frame import Frame
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.gicp import gicp
-from jaxreg.refine.icp import icp
-from jaxreg.refine.pairing import Kernel, Weighting, check_options, widenings
+from jaxreg.refine.kdtree import Method, index_cloud, iterate, padded_size
 from jaxreg.refine.point_to_plane import point_to_plane
-from jaxreg.refine.tree import Method, index_cloud, iterate, padded_size
+from jaxreg.refine.point_to_point import icp
+from jaxreg.refine.robust import Kernel, Weighting, check_options, widenings
 from jaxreg.refine.uncertainty import PoseUncertainty, pose_uncertainty, uncertainty_of_pairs
 from jaxreg.types import RigidTransform
 
@@ -149,23 +149,23 @@ def _checked(name: str, points: np.ndarray, neighbors: int) -> np.ndarray:
 
 
 def _enter(source: np.ndarray, reference: np.ndarray):
-    """`jaxreg.refine.frame.enter` in float64, which the device may not have."""
+    """`jaxreg.geometry.frame.enter` in float64, which the device may not have."""
     centres = source.mean(axis=0), reference.mean(axis=0)
     x, y = source - centres[0], reference - centres[1]
     length = np.sqrt(((x**2).sum(axis=1).mean() + (y**2).sum(axis=1).mean()) / 2)
     length = length if length > 0 else np.float64(1)
-    return scans.Frame(*centres, length), x / length, y / length
+    return frame.Frame(*centres, length), x / length, y / length
 
 
-def _pose_in(where: scans.Frame, pose: RigidTransform | None) -> RigidTransform:
+def _pose_in(where: frame.Frame, pose: RigidTransform | None) -> RigidTransform:
     pose = RigidTransform(np.eye(3), np.zeros(3)) if pose is None else pose
-    return scans.pose_in(where, RigidTransform(*(np.asarray(leaf, np.float64) for leaf in pose)))
+    return frame.pose_in(where, RigidTransform(*(np.asarray(leaf, np.float64) for leaf in pose)))
 
 
-def _pose_out(where: scans.Frame, pose: RigidTransform) -> RigidTransform:
+def _pose_out(where: frame.Frame, pose: RigidTransform) -> RigidTransform:
     rotation, translation = (np.asarray(leaf, np.float64) for leaf in pose)
     # It is orthogonal to float32 only, until here.
-    return scans.pose_out(where, RigidTransform(scans.nearest_rotation(rotation), translation))
+    return frame.pose_out(where, RigidTransform(frame.nearest_rotation(rotation), translation))
 
 
 def _padded(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,7 +174,7 @@ def _padded(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(points, ((0, size - len(points)), (0, 0))), mask
 
 
-def _in_units(uncertainty: PoseUncertainty, where: scans.Frame) -> PoseUncertainty:
+def _in_units(uncertainty: PoseUncertainty, where: frame.Frame) -> PoseUncertainty:
     """The uncertainty in the frame as one in the unit of the clouds, in float64."""
     values = PoseUncertainty(*(np.asarray(leaf, np.float64) for leaf in uncertainty))
     units = np.repeat([1.0, where.length], 3)

@@ -4,21 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg import rigid
-from jaxreg.config import RefineConfig
-from jaxreg.neighbors import knn
-from jaxreg.refine import frame
+from jaxreg.geometry import frame, rigid
+from jaxreg.geometry.neighbors import knn
+from jaxreg.geometry.normals import normals
+from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.correspondences import Pairs, closest_pairs
 from jaxreg.refine.gauss_newton import gauss_newton_step
-from jaxreg.refine.normals import normals
-from jaxreg.refine.pairing import (
-    Kernel,
-    Pairs,
-    Weighting,
-    check_options,
-    closest_pairs,
-    pair_weights,
-    widenings,
-)
+from jaxreg.refine.robust import Kernel, Weighting, check_options, pair_weights, widenings
 from jaxreg.types import RigidTransform
 
 _DEFAULT = RefineConfig()
@@ -46,7 +38,7 @@ def point_to_plane(
     ``r_i = R x_i + t - y_i``, where ``y_i`` is the reference point nearest to the moved ``x_i`` and
     ``n_i`` its normal, of `neighbors` neighbours unless `reference_normals` are given (zero where
     there is none). `kernel` weighs the distances to the planes; everything else is as for
-    `jaxreg.refine.icp.icp`. A motion that no plane opposes (a cloud that slides along a plane) is
+    `icp`. A motion that no plane opposes (a cloud that slides along a plane) is
     left out of the pose's change.
 
     Raises:

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxreg import rigid
-from jaxreg.config import RefineConfig
-from jaxreg.neighbors import knn
-from jaxreg.refine import frame
+from jaxreg.geometry import frame, rigid
+from jaxreg.geometry.neighbors import knn
+from jaxreg.geometry.normals import normals
+from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.correspondences import Pairs, closest_pairs
 from jaxreg.refine.gauss_newton import normal_equations
-from jaxreg.refine.normals import normals
-from jaxreg.refine.pairing import Kernel, Pairs, Weighting, closest_pairs
 from jaxreg.refine.point_to_plane import plane_metric
+from jaxreg.refine.robust import Kernel, Weighting
 from jaxreg.types import RigidTransform
 
 _DEFAULT = RefineConfig()

@@ -6,7 +6,7 @@ import json
 import pytest
 from flax.traverse_util import flatten_dict
 
-from benchmarks import ablation, tables
+from benchmarks.paper import ablation, tables
 from jaxreg.config import to_dict
 
 

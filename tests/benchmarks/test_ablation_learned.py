@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import ablation_learned
-from jaxreg.refine import frame
+from jaxreg.geometry import frame
 from jaxreg.types import RigidTransform
+from research import ablation_learned
 
 pytestmark = pytest.mark.loose  # The network's weights are of float32.
 

@@ -1,9 +1,10 @@
-"""The variants of `benchmarks/accuracy.py` differ from the library in the way they compute alone."""
+"""Variants of `benchmarks.paper.accuracy` differ from the library in how they compute alone."""
 
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, workload
+from benchmarks.paper import accuracy
+from benchmarks.speed import workload
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose, pytest.mark.untyped]
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import learned_features as learned
-from jaxreg.data import shapes
-from jaxreg.neighbors import squared_distances
+from jaxreg.data.procedural import shapes
+from jaxreg.geometry.neighbors import squared_distances
+from research import train_features as learned
 
 pytestmark = pytest.mark.loose
 ALL = jnp.ones(9, bool)

@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import learned_ranking as ranking
-from jaxreg.config import DenseConfig
-from jaxreg.dense.register import surfaces
+from jaxreg.search.config import SearchConfig
+from jaxreg.search.pipeline import surfaces
+from research import learned_ranking as ranking
 
 pytestmark = pytest.mark.loose
 
 
 def test_facts_of_a_cloud_on_itself(seed):
     points = jnp.asarray(np.random.default_rng(seed).normal(size=(40, 3)))
-    surface, other, _ = jax.jit(lambda x: surfaces(x, x, None, None, DenseConfig()))(points)
+    surface, other, _ = jax.jit(lambda x: surfaces(x, x, None, None, SearchConfig()))(points)
     facts = np.asarray(ranking.facts(surface, other))
     assert facts.shape == (40, 17)
     np.testing.assert_allclose(facts[:, :10], 1, atol=1e-6)  # near, on the plane, facing, alike

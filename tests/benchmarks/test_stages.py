@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import processes, scaling, stages, timing, workload
-from jaxreg import matching, model
+from benchmarks.speed import processes, scaling, stages, timing, workload
+from jaxreg.network import matching, model
 from jaxreg.types import PointCloud
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -59,7 +59,8 @@ def test_a_size_that_does_not_fit_is_a_line_and_no_failure():
 
 def test_memory_that_was_in_use_shows_in_the_peak():
     program = (
-        "from benchmarks.processes import peak_mb; before = peak_mb(); block = b'x' * 100_000_000; "
+        "from benchmarks.speed.processes import peak_mb; before = peak_mb(); "
+        "block = b'x' * 100_000_000; "
         "print(peak_mb() - before)"
     )
     text = subprocess.check_output([sys.executable, "-c", program], cwd=processes.ROOT, text=True)

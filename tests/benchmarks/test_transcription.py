@@ -1,4 +1,4 @@
-"""The library against the equations as one would first write them (`benchmarks/transcription.py`)."""
+"""The library against the equations as first written (`benchmarks.paper.transcription`)."""
 
 import dataclasses
 import functools
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import transcription
+from benchmarks.paper import transcription
 from jaxreg.config import Config, ModelConfig
-from jaxreg.model import init_variables, register_pair
-from jaxreg.pretrained import load_pretrained
+from jaxreg.network.model import init_variables, register_pair
 from jaxreg.training import batch_loss
 from jaxreg.types import Pair, PointCloud, RigidTransform
+from jaxreg.weights.released import load_pretrained
 
 # Flax promotes float64 with the float32 that it starts from.
 pytestmark = pytest.mark.loose

@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg.config import PairConfig
-from jaxreg.data import modelnet, shapes
+from jaxreg.data import modelnet
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
+from jaxreg.data.procedural import shapes
 from jaxreg.types import PointCloud
 
 SMALL = PairConfig(points=100, kept=75)
@@ -52,7 +53,7 @@ def overlap(pair):
 
 
 def predecessor_overlap(shape, rng):
-    """The predecessor's generator in numpy loops, up to the order of the points."""
+    """RIENet's generator in numpy loops, up to the order of the points."""
     angle = rng.uniform(0, np.pi / 4, 3)
     rotation = Rotation.from_euler("zyx", angle[::-1]).as_matrix()
     moved = shape @ rotation.T + rng.uniform(-0.5, 0.5, 3)

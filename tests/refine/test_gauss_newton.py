@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from jaxreg import rigid
+from jaxreg.geometry import rigid
 from jaxreg.refine.gauss_newton import (
     gauss_newton_step,
     normal_equations,

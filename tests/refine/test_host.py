@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.refine import tree
+from jaxreg.refine import kdtree
 from jaxreg.refine.host import refine
 from jaxreg.refine.uncertainty import pose_uncertainty
 from jaxreg.types import RigidTransform
@@ -107,7 +107,7 @@ def test_offset_and_unit_do_not_matter(offset, factor, dense_limit, seed):
 
 @pytest.mark.parametrize("method", METHODS[1:])
 def test_coarse_start_and_all_points_end(method, seed, monkeypatch):
-    monkeypatch.setattr(tree, "_COARSE", 300)
+    monkeypatch.setattr(kdtree, "_COARSE", 300)
     source, reference, truth = make_pair(seed, n=3000, m=4000)
     result = refine(source, reference, method=method, both_directions=True)
     assert angle_deg(result.transform.rotation, truth.rotation) < 0.05

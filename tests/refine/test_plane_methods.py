@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from jaxreg import rigid
+from jaxreg.geometry import rigid
 from jaxreg.types import RigidTransform
 from tests.compiled import gicp, point_to_plane
 

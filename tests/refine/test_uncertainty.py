@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg import rigid
+from jaxreg.geometry import rigid
 from jaxreg.refine import uncertainty as rooms
 from jaxreg.refine.point_to_plane import point_to_plane
 from jaxreg.refine.uncertainty import weak_directions

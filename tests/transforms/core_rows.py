@@ -5,20 +5,9 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg import (
-    features,
-    inliers,
-    invariants,
-    losses,
-    matching,
-    matching_blocks,
-    neighbors,
-    numerics,
-    procrustes,
-    rigid,
-    symmetric,
-)
 from jaxreg.config import LossConfig
+from jaxreg.geometry import eigen3x3, neighbors, numerics, procrustes, rigid
+from jaxreg.network import features, inliers, invariants, losses, matching, matching_blocks
 from jaxreg.types import RigidTransform
 from tests.transforms.network_rows import SMALL
 from tests.transforms.rows import (
@@ -61,50 +50,52 @@ def core_rows() -> dict[str, Row]:
     gc = functools.partial(losses.global_consistency, beta=0.01)
     gs = functools.partial(losses.geometric_consistency, config=SMALL)
     return {
-        "numerics.safe_sqrt": Row(
+        "geometry.numerics.safe_sqrt": Row(
             numerics.safe_sqrt, (RNG.uniform(1, 2, 4),), ((np.array([0.0, -1]),),)
         ),
-        "numerics.safe_norm": Row(numerics.safe_norm, (points(),), ((np.zeros((2, 3)),),)),
-        "numerics.leading_max": Row(
+        "geometry.numerics.safe_norm": Row(numerics.safe_norm, (points(),), ((np.zeros((2, 3)),),)),
+        "geometry.numerics.leading_max": Row(
             numerics.leading_max,
             (points(),),
             ((np.zeros((3, 4)),), (np.repeat(points(2), 3, axis=0),)),
         ),
-        "numerics.included_angle": Row(
+        "geometry.numerics.included_angle": Row(
             numerics.included_angle,
             (points(), points()),
             ((u, u), (u, -u), (u, zero3), (zero3, u), (zero3, zero3), (u, 1e-9 * u)),
         ),
-        "symmetric.eigh": Row(
-            lambda m: (symmetric.eigh(m).values, jnp.abs(symmetric.eigh(m).vectors)),
+        "geometry.eigen3x3.eigh": Row(
+            lambda m: (eigen3x3.eigh(m).values, jnp.abs(eigen3x3.eigh(m).vectors)),
             (tilted,),
             tuple((m,) for m in (np.zeros((3, 3)), np.eye(3), np.ones((3, 3)))),
         ),
-        "symmetric.inverse": Row(symmetric.inverse, (tilted,)),
-        "rigid.identity": Row(lambda: rigid.identity(jnp.float64), ()),
-        "rigid.apply": Row(rigid.apply, (pose(), points()), ((nowhere(), np.zeros((N, 3))),)),
-        "rigid.compose": Row(rigid.compose, (pose(), pose()), ((nowhere(), nowhere()),)),
-        "rigid.inverse": Row(rigid.inverse, (pose(),), ((nowhere(),),)),
-        "rigid.to_matrix": Row(rigid.to_matrix, (pose(),)),
-        "rigid.from_matrix": Row(rigid.from_matrix, (RNG.normal(size=(4, 4)),)),
-        "neighbors.squared_distances": Row(
+        "geometry.eigen3x3.inverse": Row(eigen3x3.inverse, (tilted,)),
+        "geometry.rigid.identity": Row(lambda: rigid.identity(jnp.float64), ()),
+        "geometry.rigid.apply": Row(
+            rigid.apply, (pose(), points()), ((nowhere(), np.zeros((N, 3))),)
+        ),
+        "geometry.rigid.compose": Row(rigid.compose, (pose(), pose()), ((nowhere(), nowhere()),)),
+        "geometry.rigid.inverse": Row(rigid.inverse, (pose(),), ((nowhere(),),)),
+        "geometry.rigid.to_matrix": Row(rigid.to_matrix, (pose(),)),
+        "geometry.rigid.from_matrix": Row(rigid.from_matrix, (RNG.normal(size=(4, 4)),)),
+        "geometry.neighbors.squared_distances": Row(
             neighbors.squared_distances, (points(), points(5)), every(lambda x: (x, x))
         ),
-        "neighbors.without_padding": Row(
+        "geometry.neighbors.without_padding": Row(
             neighbors.without_padding,
             (points(), part),
             ((np.where(part[:, None], np.ones(3), np.nan), part),),
         ),
-        "neighbors.knn": Row(
+        "geometry.neighbors.knn": Row(
             lambda x: neighbors.knn(x, K), (points(),), every(lambda x: (x,)), smooth=False
         ),
-        "neighbors.nearest_neighbor": Row(
+        "geometry.neighbors.nearest_neighbor": Row(
             neighbors.nearest_neighbor, (points(),), every(lambda x: (x,)), smooth=False
         ),
-        "neighbors.nearest_in": Row(
+        "geometry.neighbors.nearest_in": Row(
             neighbors.nearest_in, (points(), points(5)), every(lambda x: (x, x)), smooth=False
         ),
-        "procrustes.weighted_procrustes": Row(
+        "geometry.procrustes.weighted_procrustes": Row(
             procrustes.weighted_procrustes,
             (points(), points(), RNG.uniform(0.5, 1, N)),
             (
@@ -115,7 +106,7 @@ def core_rows() -> dict[str, Row]:
                 (grid(), grid() * [1.0, 1.0, -1.0], np.ones(N)),
             ),
         ),
-        "procrustes.robust_procrustes": Row(
+        "geometry.procrustes.robust_procrustes": Row(
             functools.partial(procrustes.robust_procrustes, rounds=2),
             (points(), points(), RNG.uniform(0.5, 1, N)),
             (
@@ -126,20 +117,20 @@ def core_rows() -> dict[str, Row]:
             ),
             kinks=True,  # Exact pairs are weighed by residuals that are rounding.
         ),
-        "procrustes.geman_mcclure_weights": Row(
+        "geometry.procrustes.geman_mcclure_weights": Row(
             procrustes.geman_mcclure_weights,
             (points(), points(), RNG.uniform(0.5, 1, N), pose()),
             every(lambda x: (x, x, np.ones(N), RigidTransform(np.eye(3), zero3))),
         ),
-        "procrustes.special_procrustes": Row(
+        "geometry.procrustes.special_procrustes": Row(
             procrustes.special_procrustes,
             (RNG.normal(size=(3, 3)),),
             ((np.eye(3),), (np.zeros((3, 3)),), (-np.eye(3),), (np.diag([1.0, 1, 0]),)),
         ),
-        "features.relative_neighbors": Row(
+        "network.features.relative_neighbors": Row(
             features.relative_neighbors, (points(), idx), every(lambda x: (x, idx))
         ),
-        "matching.feature_distance": Row(
+        "network.matching.feature_distance": Row(
             matching.feature_distance,
             (RNG.normal(size=(N, 4)), RNG.normal(size=(5, 4))),
             (
@@ -148,67 +139,69 @@ def core_rows() -> dict[str, Row]:
                 (np.zeros((N, 4)), np.zeros((5, 4))),
             ),
         ),
-        "matching.squared_feature_distance": Row(
+        "network.matching.squared_feature_distance": Row(
             matching.squared_feature_distance,
             (RNG.normal(size=(N, 4)), RNG.normal(size=(5, 4))),
             ((np.ones((N, 4)), np.ones((5, 4))),),
         ),
-        "matching.matching_scores": Row(
+        "network.matching.matching_scores": Row(
             matching.matching_scores,
             (scores, part),
             ((np.zeros((N, N)), part), (scores, np.zeros(N, bool)), (1e8 * scores, part)),
         ),
-        "matching.incidence": Row(
+        "network.matching.incidence": Row(
             matching.incidence, (idx,), ((np.zeros((N, K), np.int32),),), smooth=False
         ),
-        "matching.neighborhood_sum": Row(
+        "network.matching.neighborhood_sum": Row(
             matching.neighborhood_sum,
             (scores, idx, idx[::-1]),
             ((scores, np.zeros((N, K), np.int32), idx),),
         ),
-        "matching.final_distance": Row(
+        "network.matching.final_distance": Row(
             functools.partial(matching.final_distance, alpha=0.7),
             (scores, scores.T),
             ((np.zeros((N, N)), np.zeros((N, N))),),
         ),
-        "matching.matching_maps": Row(
+        "network.matching.matching_maps": Row(
             maps_of, (scores, scores.T, idx, idx), ((np.zeros((N, N)), np.zeros((N, N)), idx, idx),)
         ),
-        "matching.match": Row(
+        "network.matching.match": Row(
             matching.match,
             (scores.T, scores**2, points()),
             ((*(np.full((N, N), 1 / N),) * 2, np.ones((N, 3))),),
         ),
-        "matching_blocks.match_in_blocks": Row(
+        "network.matching_blocks.match_in_blocks": Row(
             in_blocks,
             (RNG.normal(size=(N, 4)), RNG.normal(size=(N, 4)), idx, idx, points()),
             ((np.ones((N, 4)), np.ones((N, 4)), idx, idx, np.ones((N, 3))),),
         ),
-        "invariants.edges": Row(lengths, (points(), idx), every(lambda x: (x, idx))),
-        "invariants.included_angles": Row(
+        "network.invariants.edges": Row(lengths, (points(), idx), every(lambda x: (x, idx))),
+        "network.invariants.included_angles": Row(
             invariants.included_angles,
             (RNG.normal(size=(N, K, 3)),),
             ((np.zeros((N, K, 3)),), (np.ones((N, K, 3)),)),
         ),
-        "invariants.rounding_error": Row(
+        "network.invariants.rounding_error": Row(
             invariants.rounding_error, (points(),), every(lambda x: (x,)), smooth=False
         ),
-        "invariants.geometric_structure": Row(
+        "network.invariants.geometric_structure": Row(
             structure, (points(), idx), every(lambda x: (x, idx))
         ),
-        "inliers.select_inliers": Row(
+        "network.inliers.select_inliers": Row(
             lambda w, m: inliers.select_inliers(w, 4, m),
             (RNG.uniform(size=N), part),
             ((np.ones(N), mask), (np.ones(N), np.zeros(N, bool))),
             smooth=False,
         ),
-        "losses.huber": Row(huber, (RNG.uniform(0, 1, 9),), ((np.array([0.0, 0.5, 1e9]),),)),
-        "losses.global_consistency": Row(
+        "network.losses.huber": Row(
+            huber, (RNG.uniform(0, 1, 9),), ((np.array([0.0, 0.5, 1e9]),),)
+        ),
+        "network.losses.global_consistency": Row(
             gc,
             (everything(points()), everything(points(6))),
             every(lambda x: (everything(x), everything(x))),
         ),
-        "losses.neighborhood_consistency": Row(
+        "network.losses.neighborhood_consistency": Row(
             losses.neighborhood_consistency,
             (points(), points(), pose(), idx, inlier_idx, valid),
             (
@@ -216,22 +209,22 @@ def core_rows() -> dict[str, Row]:
                 (points(), points(), pose(), idx, inlier_idx, ~valid),
             ),
         ),
-        "losses.geometric_consistency": Row(
+        "network.losses.geometric_consistency": Row(
             gs,
             (points(), points(), idx, inlier_idx, valid),
             every(lambda x: (x, x, idx, inlier_idx, valid)),
         ),
-        "losses.spatial_consistency": Row(
+        "network.losses.spatial_consistency": Row(
             losses.spatial_consistency,
             (RNG.uniform(0.1, 1, N), inlier_idx, valid),
             ((np.zeros(N), inlier_idx, valid), (np.ones(N), inlier_idx, ~valid)),
         ),
-        "losses.pose_error": Row(
+        "network.losses.pose_error": Row(
             losses.pose_error,
             (everything(points()), points()),
             every(lambda x: (everything(x), x)),
         ),
-        "losses.total_loss": Row(
+        "network.losses.total_loss": Row(
             functools.partial(losses.total_loss, config=LossConfig()),
             (losses.LossTerms(*RNG.uniform(size=(4, 2))),),
         ),

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxreg import features, inliers, losses, model
 from jaxreg.config import Config, LossConfig, ModelConfig
+from jaxreg.network import features, inliers, losses, model
 from jaxreg.types import PointCloud
 from tests.transforms.rows import K, N, Row, every, points
 
@@ -122,25 +122,25 @@ def network_and_model_rows() -> dict[str, Row]:
     pairs = every(lambda x: (variables, x, x))
     return {
         **network_rows(),
-        "model.neighborhood_graph": Row(
+        "network.model.neighborhood_graph": Row(
             lambda x: model.neighborhood_graph(everything_traced(x), SMALL),
             (points(),),
             every(lambda x: (x,)),
             smooth=False,
         ),
-        "model.init_variables": Row(
+        "network.model.init_variables": Row(
             lambda: model.init_variables(jax.random.key(3), SMALL), (), smooth=False, loose=True
         ),
-        "model.point_features": Row(
+        "network.model.point_features": Row(
             cloud_features, (variables, source), every(lambda x: (variables, x)), loose=True
         ),
-        "model.iterate": Row(
+        "network.model.iterate": Row(
             iterated, (variables, source, near), pairs, loose=True, kinks=True, parts=True
         ),
-        "model.register_pair": Row(
+        "network.model.register_pair": Row(
             register, (variables, source, near), pairs, loose=True, kinks=True
         ),
-        "losses.step_losses": Row(
+        "network.losses.step_losses": Row(
             total_of_a_step, (variables, source, near), pairs, loose=True, kinks=True, parts=True
         ),
     }

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxreg.geometry import frame, normals
 from jaxreg.refine import (
-    frame,
+    correspondences,
     gauss_newton,
     gicp,
-    icp,
-    normals,
-    pairing,
     point_to_plane,
+    point_to_point,
+    robust,
     uncertainty,
 )
 from jaxreg.types import RigidTransform
@@ -21,12 +21,12 @@ from tests.transforms.rows import N, Row, every, neighbor_graph, nowhere, points
 
 RNG = np.random.default_rng(2)
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
-WIDE = pairing.Weighting("geman_mcclure", 0.5, 10.0, 1.0)
+WIDE = robust.Weighting("geman_mcclure", 0.5, 10.0, 1.0)
 
 
 def pairs():
     rows = np.arange(N, dtype=np.int32)
-    return pairing.Pairs(rows, rows[::-1].copy(), np.ones(N, bool))
+    return correspondences.Pairs(rows, rows[::-1].copy(), np.ones(N, bool))
 
 
 def none(these):
@@ -48,12 +48,12 @@ def entered(source, reference):
 
 
 def closest(moved, reference):
-    return pairing.closest_pairs(moved, reference, None, None, both_directions=True)
+    return correspondences.closest_pairs(moved, reference, None, None, both_directions=True)
 
 
 def weights(distance, residual, these, scale):
     weighting = WIDE._replace(scale=scale)
-    return pairing.pair_weights(distance, residual, these.mask, weighting, 2.0)
+    return robust.pair_weights(distance, residual, these.mask, weighting, 2.0)
 
 
 def small_parts() -> dict[str, Row]:
@@ -109,7 +109,7 @@ def small_parts() -> dict[str, Row]:
             closest, (points(), points(5)), every(lambda x: (x, x)), smooth=False
         ),
         "pairing.with_neighbors": Row(
-            lambda x, y: pairing.with_neighbors(
+            lambda x, y: correspondences.with_neighbors(
                 closest(x, y), jnp.asarray(graph), jnp.asarray(graph % 5), forward=N
             ),
             (points(), points(5)),
@@ -121,13 +121,13 @@ def small_parts() -> dict[str, Row]:
             ((np.zeros(N), np.zeros(N), none(pairs()), np.float64(0.5)),),
         ),
         "pairing.kernel_weight": Row(
-            lambda x: [pairing.kernel_weight(x, k) for k in ("huber", "cauchy", "gaussian")],
+            lambda x: [robust.kernel_weight(x, k) for k in ("huber", "cauchy", "gaussian")],
             (RNG.uniform(0.1, 3, N),),
             ((np.zeros(N),), (np.full(N, 1e30),)),
         ),
-        "pairing.widenings": Row(lambda: pairing.widenings(4, 3.0, jnp.float64), ()),
+        "pairing.widenings": Row(lambda: robust.widenings(4, 3.0, jnp.float64), ()),
         "pairing.masked_quantile": Row(
-            lambda x, m: pairing.masked_quantile(x, m, 0.5),
+            lambda x, m: robust.masked_quantile(x, m, 0.5),
             (RNG.uniform(size=N), mask),
             ((np.zeros(N), mask), (np.ones(N), ~mask & mask)),
         ),
@@ -152,11 +152,11 @@ def steps_and_loops() -> dict[str, Row]:
             ((IDENTITY, x, x, np.zeros((N, 3, 3))), (IDENTITY, 0 * x, 0 * x, flat)),
         ),
         "icp.point_to_point_step": Row(
-            functools.partial(icp.point_to_point_step, weighting=WIDE),
+            functools.partial(point_to_point.point_to_point_step, weighting=WIDE),
             (IDENTITY, x, y, pairs()),
             (*at_identity, (pose(), x, y, none(pairs()))),
         ),
-        "icp.icp": Row(functools.partial(icp.icp, **few), (x, y), same),
+        "icp.icp": Row(functools.partial(point_to_point.icp, **few), (x, y), same),
         "point_to_plane.plane_metric": Row(
             functools.partial(point_to_plane.plane_metric, weighting=WIDE),
             (x, y, tilted, pairs()),

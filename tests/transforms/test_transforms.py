@@ -23,33 +23,38 @@ from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.refine_rows import refine_rows
 from tests.transforms.rows import Row
 
-HOST = {"config.load_config", "pretrained.available_weights", "pretrained.load_pretrained"}
-HOST |= {"register.register", "refine.frame.check_clouds", "refine.pairing.check_options"}
+HOST = {
+    "config.load_config",
+    "weights.released.available_weights",
+    "weights.released.load_pretrained",
+}
+HOST |= {"scans.pair.register", "geometry.frame.check_clouds", "refine.robust.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 """Functions that read files or numpy arrays on the host: no transform applies to them."""
-HALVES = {"matching.gather_rows", "matching.collect_rows"}
+HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
 """Of `neighborhood_sum` and of its transpose, which knows one as the derivative of the other."""
 ROOMS = (
-    "numerics",
-    "symmetric",
-    "rigid",
-    "neighbors",
-    "procrustes",
-    "features",
-    "matching",
-    "matching_blocks",
-    "invariants",
-    "inliers",
-    "model",
-    "losses",
-    "refine.frame",
+    "geometry.numerics",
+    "geometry.eigen3x3",
+    "geometry.rigid",
+    "geometry.neighbors",
+    "geometry.procrustes",
+    "network.features",
+    "network.matching",
+    "network.matching_blocks",
+    "network.invariants",
+    "network.inliers",
+    "network.model",
+    "network.losses",
+    "geometry.frame",
     "refine.gauss_newton",
     "refine.gicp",
-    "refine.icp",
-    "refine.normals",
-    "refine.pairing",
+    "refine.point_to_point",
+    "geometry.normals",
+    "refine.correspondences",
     "refine.point_to_plane",
     "refine.uncertainty",
+    "refine.robust",
 )
 
 TABLE = core_rows() | network_and_model_rows() | refine_rows()
@@ -224,7 +229,7 @@ def test_derivatives_are_finite_and_modes_agree_at_degenerate_inputs(name, row, 
             np.testing.assert_allclose(reverse, forward, atol=1e-7 * size, err_msg=message)
 
 
-@rows(["losses.step_losses"])
+@rows(["network.losses.step_losses"])
 def test_derivatives_hold_in_optimised_kernels_too(name, row, seed):
     """The other tests compile without LLVM's optimisation, which rounds what is computed twice anew."""
     function, values, leaves = floating(row, row.generic)
@@ -245,7 +250,9 @@ def test_derivatives_hold_in_optimised_kernels_too(name, row, seed):
 
 @pytest.mark.untyped
 @pytest.mark.parametrize(
-    "row", ["neighbors.knn", "numerics.included_angle", "rigid.apply"], indirect=True
+    "row",
+    ["geometry.neighbors.knn", "geometry.numerics.included_angle", "geometry.rigid.apply"],
+    indirect=True,
 )
 def test_numpy_arrays_are_welcome(row):
     assert_close(row.function(*row.generic), row.function(*arrays(row.generic)), 1e-12)

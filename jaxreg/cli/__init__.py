@@ -1,0 +1,5 @@
+"""The command `jaxreg`."""
+
+from jaxreg.cli.commands import main
+
+__all__ = ["main"]

@@ -1,0 +1,42 @@
+"""The process of a command: a cache of programs on disk, and memory pages; no library may do this."""
+
+import os
+import sys
+from pathlib import Path
+
+import jax
+
+
+def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
+    """Keep programs that took `least_seconds` to compile on disk, for this user's next process.
+
+    Used by the command line tools only; a library must not change a program's configuration. A cache
+    that others could write to would run their code, so the directory is private (0700). Set
+    JAX_COMPILATION_CACHE_DIR to choose another. Where none can be made, nothing is kept.
+    """
+    if not jax.config.jax_compilation_cache_dir:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        directory = root / "jaxreg" / "xla"
+        try:
+            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", least_seconds)
+
+
+_HUGE_PAGES = "glibc.malloc.hugetlb"
+
+
+def restart_with_huge_pages() -> None:
+    """Start this program again with memory in pages of 2 MB, if it runs on Linux without them.
+
+    A training step works in half a gigabyte that XLA:CPU asks for anew each time; the kernel hands it
+    out in 130,000 pages of 4 KB, which takes an eighth of the step. The C library reads its setting
+    once, when a process starts. Called by train.py before anything else is done, and where
+    GLIBC_TUNABLES sets it either way nothing happens.
+    """
+    tunables = os.environ.get("GLIBC_TUNABLES", "")
+    if sys.platform == "linux" and _HUGE_PAGES not in tunables:
+        os.environ["GLIBC_TUNABLES"] = ":".join(filter(None, [tunables, f"{_HUGE_PAGES}=1"]))
+        os.execv(sys.executable, sys.orig_argv)

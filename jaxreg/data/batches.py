@@ -1,0 +1,87 @@
+"""Streams of pairs in batches of one size: made from shapes, or given by a data set."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxreg._xla import jit
+from jaxreg.config import PairConfig
+from jaxreg.data.pairs import make_pair, make_pair_from_scans
+from jaxreg.geometry import rigid
+from jaxreg.types import Pair, PointCloud, RigidTransform
+
+_TEST, _VALIDATION = 0, 1  # Streams of random keys below the seed of the test pairs.
+
+
+def test_key(seed: int) -> PRNGKeyArray:
+    """Key of the stream of test pairs; pair `i` of it is made from ``fold_in(key, i)``."""
+    return jax.random.fold_in(jax.random.key(seed), _TEST)
+
+
+def validation_key(seed: int) -> PRNGKeyArray:
+    """Key of the stream of validation pairs."""
+    return jax.random.fold_in(jax.random.key(seed), _VALIDATION)
+
+
+def _make_batch(key, numbers, shapes, *, config: PairConfig) -> Pair:
+    one = lambda number, shape: make_pair(jax.random.fold_in(key, number), shape, config)  # noqa: E731
+    return jax.vmap(one)(numbers, shapes)
+
+
+_make_batch_jit = jit(_make_batch, static_argnames="config")
+
+
+def pair_batches(
+    shapes: Float[np.ndarray, "s p 3"], key: PRNGKeyArray, *, config: PairConfig, batch: int
+) -> Iterator[tuple[Pair, int]]:
+    """One pair a shape, in batches; pair `i` depends on `key`, `i` and shape `i` only.
+
+    Every batch has the same size, so that nothing is compiled twice: the last is filled up with
+    pairs from the start. The number of pairs that count comes with each batch.
+    """
+    for start in range(0, len(shapes), batch):
+        numbers = np.arange(start, start + batch) % len(shapes)
+        yield (
+            _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config),
+            min(batch, len(shapes) - start),
+        )
+
+
+def _given_batch(key, numbers, source, target, transform, *, config: PairConfig) -> Pair:
+    def one(number, source, target, matrix):
+        pose = RigidTransform(matrix[:3, :3], matrix[:3, 3])
+        everywhere = jnp.ones(source.shape[0], bool)
+        still = rigid.apply(rigid.inverse(pose), target)
+        clouds = (PointCloud(points, everywhere) for points in (source, still))
+        return make_pair_from_scans(jax.random.fold_in(key, number), *clouds, config, pose)
+
+    return jax.vmap(one)(numbers, source, target, transform)
+
+
+_given_batch_jit = jit(_given_batch, static_argnames="config")
+
+
+def given_pair_batches(
+    clouds: tuple[Float[np.ndarray, "s p 3"], Float[np.ndarray, "s p 3"]],
+    transforms: Float[np.ndarray, "s 4 4"],
+    key: PRNGKeyArray,
+    *,
+    config: PairConfig,
+    batch: int,
+) -> Iterator[tuple[Pair, int]]:
+    """As `pair_batches`, of given sources and references in the pose that `transforms` says."""
+    source, target = clouds
+    for start in range(0, len(source), batch):
+        numbers = np.arange(start, start + batch) % len(source)
+        matrices = transforms[numbers].astype(source.dtype)
+        chosen = (jnp.asarray(numbers), source[numbers], target[numbers], matrices)
+        yield _given_batch_jit(key, *chosen, config=config), min(batch, len(source) - start)
+
+
+def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:
+    """The true transforms of the pairs (numpy, stacked)."""
+    parts = [jax.tree.map(lambda x, c=n: np.array(x)[:c], pair.transform) for pair, n in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

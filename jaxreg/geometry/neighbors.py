@@ -1,0 +1,129 @@
+"""Neighbours inside one cloud and between two, by exact differences of coordinates.
+
+The product form ``|x|^2 - 2 x.y + |y|^2`` is not used for points: a thousand units away from the
+origin it names the wrong neighbour every second time.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._xla import at_row_min, row_min
+
+_BLOCK = 2048
+"""Points whose distances to all others are held at once."""
+
+
+def squared_distances(
+    points: Float[Array, "n 3"], others: Float[Array, "m 3"]
+) -> Float[Array, "n m"]:
+    """``d[i, j] = |points[i] - others[j]|^2``."""
+    differences = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
+    return sum(d * d for d in differences)
+
+
+def without_padding(
+    points: Float[Array, "n 3"], mask: Bool[Array, "n"] | None
+) -> Float[Array, "n 3"]:
+    """`points` with every padded row set to zero, so that a NaN there can reach nothing."""
+    return points if mask is None else jnp.where(mask[:, None], points, 0)
+
+
+def knn(
+    points: Float[Array, "n 3"], k: int, mask: Bool[Array, "n"] | None = None
+) -> Int[Array, "n k"]:
+    """The `k` nearest other points of every point, nearest first (the graph N_o).
+
+    If ``idx[i, r] = j`` then ``points[j]`` is the (r+1)-th nearest point of ``points[i]`` with
+    ``j != i``. Coincident points are neighbours of each other at distance 0. Equal distances are
+    ordered by coordinates (their bits), not by row, so that permuting the points permutes the graph.
+    Where fewer than `k` valid others exist, a point fills the rest of its list with itself.
+
+    Raises:
+      ValueError: `points` is not ``(n, 3)``, or not ``1 <= k < n``.
+    """
+    _check_points(points)
+    n = points.shape[0]
+    if not 1 <= k < n:
+        raise ValueError(
+            f"k = {k} neighbours do not exist in a cloud of n = {n} points: "
+            "choose 1 <= k < n, or give more points."
+        )
+    points = jax.lax.stop_gradient(without_padding(jnp.asarray(points), mask))
+    order = _scattered(points)
+    candidates, row = points[order], jnp.arange(n, dtype=order.dtype)
+
+    def of_rows(row):
+        distance = squared_distances(points[row], candidates)
+        excluded = order[None, :] == row[:, None]
+        if mask is not None:
+            excluded = excluded | ~mask[order][None, :]
+        negative, column = jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
+        return jnp.where(jnp.isneginf(negative), row[:, None], order[column])
+
+    if n <= _BLOCK:
+        index = of_rows(row)
+    else:
+        # Rows in blocks, since all distances of a large cloud at once would fill the memory.
+        blocks = jnp.pad(row, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
+        index = jax.lax.map(of_rows, blocks).reshape(-1, k)[:n]
+    # The barrier keeps XLA from merging later slices into the selection, which would turn the
+    # fast call into a full sort of every row.
+    return jax.lax.optimization_barrier(index.astype(jnp.int32))
+
+
+def nearest_neighbor(
+    points: Float[Array, "n 3"], mask: Bool[Array, "n"] | None = None
+) -> Int[Array, "n"]:
+    """Index of the nearest other point: ``points[idx]`` is the 1-NN cloud (Eq. 1-2, i != m).
+
+    Raises:
+      ValueError: `points` is not ``(n, 3)``, or has fewer than two rows.
+    """
+    return knn(points, 1, mask)[:, 0]
+
+
+def nearest_in(
+    points: Float[Array, "n 3"],
+    others: Float[Array, "m 3"],
+    mask: Bool[Array, "m"] | None = None,
+) -> Int[Array, "n"]:
+    """Index into `others` of the nearest valid one of every point.
+
+    Of those that are equally near, up to rounding, it is the first.
+    """
+    distance = jax.lax.stop_gradient(squared_distances(points, without_padding(others, mask)))
+    if mask is not None:
+        distance = jnp.where(mask[None, :], distance, jnp.inf)
+    # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
+    # argmin, which carries both through one reduction, element by element.
+    column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
+    return row_min(jnp.where(at_row_min(distance), column, others.shape[0] - 1))
+
+
+def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:
+    """An order as good as random that depends on the points alone: not on their rows, nor on padding.
+
+    A selection on a CPU keeps the best so far, and replaces them rarely where near points come at
+    random: that of 16 in 768 takes two thirds of its time after sorting by x.
+    """
+    width = jnp.finfo(points.dtype).bits
+    bits = jax.lax.bitcast_convert_type(points, jnp.dtype(f"uint{width}"))
+    # Multiplicative hashing (Knuth, volume 3, section 6.4).
+    odd = jnp.asarray(0x9E3779B97F4A7C15 % 2**width, bits.dtype)
+    mixed = jnp.zeros_like(bits[:, 0])
+    for axis in range(3):
+        mixed = (mixed ^ bits[:, axis]) * odd
+        mixed = mixed ^ (mixed >> (width // 2))  # The low bits of round numbers are all zero.
+    return jnp.lexsort((*points.T, mixed))
+
+
+def _check_points(points: Array) -> None:
+    try:
+        chex.assert_shape(points, (None, 3))
+    except AssertionError:
+        raise ValueError(
+            f"points must have shape (n, 3), got {points.shape}: give one cloud, "
+            "and use jax.vmap for a batch."
+        ) from None

@@ -1,0 +1,112 @@
+"""Local features of one cloud: a DGCNN on the coordinates of neighbours relative to their centre."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._xla import gradient_written_out
+from jaxreg.geometry.numerics import leading_max
+
+BATCH_AXIS = "batch"
+"""Name of the `vmap` axis over which BatchNorm takes its statistics while training."""
+
+
+def relative_neighbors(
+    points: Float[Array, "n 3"], neighbors: Int[Array, "n k"]
+) -> Float[Array, "n k 3"]:
+    """``points[neighbors[i, r]] - points[i]``: unchanged when the cloud is translated."""
+    return points[neighbors] - points[:, None]
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation over all valid points of all clouds of a batch.
+
+    While training, statistics run over the leading axes and over the `vmap` axis `BATCH_AXIS`;
+    padding does not count (but must be finite), and every point counts the same whatever the size
+    of its cloud. At evaluation running means are used and no batch axis is needed.
+    """
+
+    momentum: float
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "*points c"], mask: Bool[Array, "*#points"], *, train: bool
+    ) -> Float[Array, "*points c"]:
+        return _Normalize(self.momentum, name="BatchNorm_0")(x, mask, train=train)
+
+
+class _Normalize(nn.Module):
+    """``(x - mean) / sqrt(var + epsilon) * scale + bias``, the variables named as Flax names them.
+
+    Flax's own takes the mean over the clouds of the mean over each cloud, which weighs a point by
+    the size of its cloud.
+    """
+
+    momentum: float
+    epsilon: float = 1e-5
+
+    @nn.compact
+    def __call__(self, x, mask, *, train: bool):
+        scale, bias = (
+            self.param(name, getattr(nn.initializers, kind), x.shape[-1:])
+            for name, kind in (("scale", "ones"), ("bias", "zeros"))
+        )
+        mean, var = (
+            self.variable("batch_stats", name, kind, x.shape[-1:])
+            for name, kind in (("mean", jnp.zeros), ("var", jnp.ones))
+        )
+        statistics = mean.value, var.value
+        if train:
+            statistics = _statistics(x, mask)
+            for running, batch in zip((mean, var), statistics, strict=True):
+                batch = batch.astype(running.value.dtype)
+                running.value = self.momentum * running.value + (1 - self.momentum) * batch
+        factor = jax.lax.rsqrt(statistics[1] + self.epsilon) * scale
+        axes = tuple(range(x.ndim - 1))
+        center, factor, bias = (jnp.expand_dims(v, axes) for v in (statistics[0], factor, bias))
+        return (x - center) * factor + bias
+
+
+def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
+    """Mean and variance of every channel over the valid points of the whole batch."""
+    # A sum over points is a product with the mask: XLA:CPU reduces long columns slowly.
+    weight = jnp.broadcast_to(mask, x.shape[:-1]).reshape(-1).astype(x.dtype)
+    x = x.reshape(-1, x.shape[-1])
+
+    def over_batch(values):
+        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), BATCH_AXIS)
+
+    count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)
+    mean = over_batch(x) / count
+    # Two passes: E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
+    return mean, over_batch((x - mean[None, :]) ** 2) / count
+
+
+class DGCNN(nn.Module):
+    """Features of the points from their neighbourhoods, ``F = f(max_k, ...)``.
+
+    Shared layers with BatchNorm and ReLU lift every edge; after each, the maximum over the K edges is
+    kept; the concatenation goes through one more layer. This is the simplified DGCNN (no graph in
+    feature space) of RIENet.
+    """
+
+    channels: tuple[int, ...]
+    width: int
+    bn_momentum: float
+
+    @nn.compact
+    def __call__(
+        self, edges: Float[Array, "n k d"], mask: Bool[Array, "n"], *, train: bool
+    ) -> Float[Array, "n c"]:
+        edges = jnp.where(mask[:, None, None], edges, 0)
+        # K in front: the maximum over it is then an elementwise maximum of contiguous blocks.
+        x, pooled = jnp.swapaxes(edges, 0, 1), []
+        for channels in self.channels:
+            x = gradient_written_out(nn.Dense(channels, use_bias=False)(x))
+            x = jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask[None, :], train=train))
+            pooled.append(leading_max(x))
+        x = nn.Dense(self.width, use_bias=False)(jnp.concatenate(pooled, axis=-1))
+        x = gradient_written_out(x)
+        return jax.nn.relu(BatchNorm(self.bn_momentum)(x, mask, train=train))

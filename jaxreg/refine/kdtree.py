@@ -1,0 +1,158 @@
+"""Iterations whose pairs come from a k-d tree on the host: the driver of all three residuals.
+
+The tree finds the pairs in float64 on the CPU, the step is the pure one of `icp`, `point_to_plane`
+or `gicp`, jitted. Arrays are padded to a few sizes, so that a new size of cloud seldom compiles.
+"""
+
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
+
+from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
+from jaxreg.refine.correspondences import Pairs
+from jaxreg.refine.gicp import gicp_step
+from jaxreg.refine.point_to_plane import point_to_plane_step
+from jaxreg.refine.point_to_point import point_to_point_step
+from jaxreg.refine.robust import Weighting
+from jaxreg.types import RigidTransform
+
+Method = Literal["icp", "point_to_plane", "gicp"]
+
+_COARSE = 30_000
+"""Points of a cloud that find the pose before all of them polish it."""
+_SMALLEST = 256
+"""Smallest padded size: below, one compilation more costs more than the padding."""
+
+
+class IndexedCloud(NamedTuple):
+    """A cloud on the host with its tree, and on the device, padded, with its normals and edges."""
+
+    points: np.ndarray
+    tree: cKDTree
+    padded: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    edge_normals: Float[Array, "n 3"]
+
+
+def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
+    """Tree, normals and edges of a cloud (n, 3)."""
+    tree = cKDTree(points)
+    # One more than asked for: the point finds itself, and a row of its own index does not count.
+    _, index = tree.query(points, k=neighbors + 1, workers=-1)
+    size = padded_size(len(points))
+    rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
+    rows[: len(points)] = index
+    padded = jax.device_put(np.pad(points, ((0, size - len(points)), (0, 0))))
+    return IndexedCloud(points, tree, padded, *_normals(padded, rows))
+
+
+def iterate(
+    pose: RigidTransform,
+    source: IndexedCloud,
+    reference: IndexedCloud,
+    weighting: Weighting,
+    widths: np.ndarray,
+    *,
+    method: Method,
+    thickness: float,
+    edges: bool,
+    both_directions: bool,
+    tolerance: float,
+) -> tuple[RigidTransform, int, bool, Pairs]:
+    """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
+
+    `widths` are the widenings of the kernel, 1 the last. Where a step is below `tolerance` half of
+    the remaining ones are skipped, and at width 1 all are. Large clouds first converge with every
+    k-th point.
+    """
+    stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
+    levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
+    taken, converged, pairs = 0, False, None
+    for stride, widths in levels:
+        i, converged = 0, False
+        while i < len(widths) and not converged:
+            pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
+            new = _step(
+                pose, source[2:], reference[2:], pairs,
+                weighting.scale, weighting.max_distance, float(widths[i]),
+                kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
+                edges=edges,
+            )  # fmt: skip
+            new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
+            still = _change(pose, new) < tolerance
+            pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
+            # From a wider kernel at least to the next one, at most to the last.
+            halfway = min((i + len(widths)) // 2, len(widths) - 1)
+            i = max(i + 1, halfway) if still else i + 1
+    return pose, taken, converged, pairs
+
+
+def tree_pairs(
+    pose: RigidTransform,
+    source: IndexedCloud,
+    reference: IndexedCloud,
+    stride: int,
+    *,
+    both_directions: bool,
+) -> Pairs:
+    """`closest_pairs` of every `stride`-th point, padded, by the trees of the unmoved clouds."""
+    rotation, translation = pose
+    rows = np.arange(0, len(source.points), stride)
+    moved = source.points[rows] @ rotation.T + translation
+    source_index, reference_index = rows, reference.tree.query(moved, workers=-1)[1]
+    if both_directions:
+        rows = np.arange(0, len(reference.points), stride)
+        back = (reference.points[rows] - translation) @ rotation
+        source_index = np.concatenate([source_index, source.tree.query(back, workers=-1)[1]])
+        reference_index = np.concatenate([reference_index, rows])
+    count = len(source_index)
+    padding = (0, padded_size(count) - count)
+    return Pairs(
+        np.pad(source_index, padding).astype(np.int32),
+        np.pad(reference_index, padding).astype(np.int32),
+        np.pad(np.ones(count, bool), padding),
+    )
+
+
+def padded_size(count: int) -> int:
+    """The next of 256, 320, 384, 448, 512, 640 ...: at most a quarter of padding above 256."""
+    unit = 1 << max((count - 1).bit_length() - 3, 0)
+    return max(-(-count // unit) * unit, _SMALLEST)
+
+
+@jax.jit
+def _normals(points, neighbors):
+    across = normals(points, neighbors)
+    return across, edge_normals(points, neighbors, across)
+
+
+_STATIC = ("kernel", "trim", "method", "thickness", "edges")
+
+
+@partial(jax.jit, static_argnames=_STATIC)
+def _step(
+    pose, source, reference, pairs, scale, max_distance, width, *,
+    kernel, trim, method, thickness, edges,
+):  # fmt: skip
+    (x, *source_surface), (y, *reference_surface) = source, reference
+    weighting = Weighting(kernel, scale, max_distance, trim)
+    pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
+    if method == "icp":
+        return point_to_point_step(pose, x, y, pairs, weighting, width)
+    if method == "point_to_plane":
+        return point_to_plane_step(pose, x, y, reference_surface[0], pairs, weighting, width)
+    covariances = [
+        surface_covariances(across, thickness, ends if edges else None)
+        for across, ends in (source_surface, reference_surface)
+    ]
+    return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=thickness)
+
+
+def _change(old: RigidTransform, new: RigidTransform) -> float:
+    """The larger of rotation (radians, for small ones) and translation between two poses."""
+    turned = np.linalg.norm(new.rotation - old.rotation) / np.sqrt(2)
+    return max(float(turned), float(np.linalg.norm(new.translation - old.translation)))

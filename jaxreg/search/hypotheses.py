@@ -1,0 +1,82 @@
+"""A pose from each of the clearest candidates, a quick score of each, and the distinct best."""
+
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Float, Int
+
+from jaxreg.geometry.neighbors import squared_distances
+from jaxreg.geometry.procrustes import weighted_procrustes
+from jaxreg.search.compatibility import second_order, spectral_weights
+from jaxreg.search.nearest import NearestGrid, lookup
+from jaxreg.search.surface import Surface
+from jaxreg.types import RigidTransform
+
+
+def pose_hypotheses(
+    source: Float[Array, "c 3"],
+    reference: Float[Array, "c 3"],
+    first: Float[Array, "c c"],
+    *,
+    seeds: int,
+    partners: int,
+) -> RigidTransform:
+    """One pose (leading axis s) from each of the first `seeds` candidates and its best `partners`.
+
+    Partners are ranked by second-order compatibility; the weights of the Procrustes solution are
+    the leading eigenvector of the compatibility among them. The seeds are the clearest candidates,
+    not those that agree with most others: where nine of ten are wrong, that loses the right ones.
+    """
+    among = second_order(first, seeds)
+    _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, partners))
+    own = jnp.arange(seeds, dtype=members.dtype)[:, None]
+    members = jnp.concatenate([own, members], axis=1)
+    local = first[members[:, :, None], members[:, None, :]]
+    weights = spectral_weights(local)
+    return jax.vmap(weighted_procrustes)(source[members], reference[members], weights)
+
+
+def screen(
+    poses: RigidTransform, source: Surface, reference: Surface, grid: NearestGrid, *, width: float
+) -> Float[Array, "s"]:
+    """Share of the source that a pose lays on the reference, in [0, 1]: cheap, and one way.
+
+    Mean of ``exp(-d^2 / (2 width^2)) (n . m)^2`` over the source points; `grid` is of the reference.
+    """
+    moved = _turned(poses.rotation, source.points) + poses.translation[:, None]
+    normals = _turned(poses.rotation, source.normals)
+    nearest = lookup(grid, moved)
+    squared = jnp.sum((moved - reference.points[nearest]) ** 2, axis=-1)
+    facing = jnp.sum(normals * reference.normals[nearest], axis=-1) ** 2
+    overlap = jnp.where(source.mask[None, :], jnp.exp(-squared / (2 * width**2)) * facing, 0)
+    count = jnp.maximum(jnp.sum(source.mask), 1).astype(overlap.dtype)
+    return jnp.sum(overlap, axis=1) / count
+
+
+def pick_distinct(
+    poses: RigidTransform, score: Float[Array, "s"], *, count: int, angle: float, distance: float
+) -> Int[Array, "count"]:
+    """The best pose, the best of those that differ from it, and so on.
+
+    Two poses are the same when they turn by less than `angle` (radians) from each other and take
+    the origin, which should be the centroid of the source, to places less than `distance` apart.
+    """
+    flat = poses.rotation.reshape(-1, 9)
+    cosine = (jnp.matmul(flat, flat.T, precision=Precision.HIGHEST) - 1) / 2
+    apart = squared_distances(poses.translation, poses.translation)
+    same = (cosine > jnp.cos(angle)) & (apart < distance**2)
+
+    def step(score: Array, _: None) -> tuple[Array, Array]:
+        best = jnp.argmax(score)
+        return jnp.where(same[best], score - 10, score), best
+
+    return jax.lax.scan(step, score, None, length=count)[1].astype(jnp.int32)
+
+
+def best_of(poses: RigidTransform, index: Int[Array, "..."]) -> RigidTransform:
+    """The poses at `index` of the leading axis."""
+    return RigidTransform(poses.rotation[index], poses.translation[index])
+
+
+def _turned(rotations: Array, vectors: Array) -> Array:
+    return jnp.einsum("sij,nj->sni", rotations, vectors, precision=Precision.HIGHEST)

@@ -1,0 +1,48 @@
+"""Padded sizes and the pairs of the trees against brute force."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxreg.geometry import rigid
+from jaxreg.refine.correspondences import closest_pairs
+from jaxreg.refine.kdtree import index_cloud, iterate, padded_size, tree_pairs
+from jaxreg.refine.robust import Weighting
+from jaxreg.types import RigidTransform
+
+
+def test_few_sizes_cover_all_counts():
+    counts = np.arange(1, 100_000)
+    sizes = np.array([padded_size(int(count)) for count in counts])
+    assert (sizes >= counts).all()
+    assert (sizes[counts >= 256] <= 1.25 * counts[counts >= 256]).all()
+    assert len(np.unique(sizes)) < 45
+
+
+def test_the_last_width_is_used_where_a_wider_one_stands_still():
+    cloud = index_cloud(np.random.default_rng(0).normal(size=(70, 3)), neighbors=5)
+    start = RigidTransform(np.eye(3), np.zeros(3))  # the right pose: no width moves it
+    options = {"thickness": 0.01, "edges": False, "both_directions": False, "tolerance": 1e-5}
+    weighting = Weighting("geman_mcclure", None, np.inf, 1.0)
+    for widths, steps in (([8.0, 1.0], 2), ([8.0, 4.0, 2.0, 1.0], 3), ([1.0, 1.0], 1)):
+        _, taken, converged, _ = iterate(
+            start, cloud, cloud, weighting, np.array(widths, np.float32), method="gicp", **options
+        )
+        assert (taken, converged) == (steps, True)
+
+
+@pytest.mark.parametrize("both_directions", [False, True])
+def test_pairs_equal_brute_force(both_directions, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(70, 3)), rng.normal(size=(90, 3))
+    pose = RigidTransform(Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3))
+    clouds = [index_cloud(points, neighbors=5) for points in (x, y)]
+    pairs = tree_pairs(pose, *clouds, 1, both_directions=both_directions)
+    moved = rigid.apply(RigidTransform(*map(jnp.asarray, pose)), jnp.asarray(x))
+    expected = closest_pairs(moved, jnp.asarray(y), None, None, both_directions=both_directions)
+    count = len(expected.mask)
+    np.testing.assert_array_equal(pairs.source_index[:count], expected.source_index)
+    np.testing.assert_array_equal(pairs.reference_index[:count], expected.reference_index)
+    assert pairs.mask[:count].all()
+    assert not pairs.mask[count:].any()

@@ -1,0 +1,92 @@
+"""A registration in words and figures."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxreg.scans import summary
+from jaxreg.scans.pair import ScanRegistration
+from jaxreg.scans.verdict import Evidence
+
+
+@pytest.fixture
+def result(seed):
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(rng=rng).as_matrix()
+    return ScanRegistration(
+        rotation=rotation,
+        translation=np.array([1e6, -2.0, 0.5]),
+        transformation=np.eye(4),
+        confidence=np.array([0.0, 1.0, 0.5]),
+        correspondences=np.full((3, 3), np.nan),
+        reach=0.1,
+        fitness=0.8,
+        inlier_rmse=0.02,
+        overlap=0.6,
+        covariance=np.diag([1e-6, 4e-6, 1e-6, 1e-4, 9e-4, 1e-4]),
+        weak_directions=("one", "another"),
+        success=False,
+        probability=0.25,
+        evidence=Evidence(0.6, 0.5, np.inf, 0.0, 0.3, 0.2),
+        seconds=1.0,
+        dropped=2,
+    )
+
+
+def test_verdict_says_which_and_how_sure(result):
+    assert (
+        summary.verdict_line(result) == "not trustworthy (probability 0.25 that the pose is right)"
+    )
+    good = result._replace(success=True, probability=0.9)
+    assert summary.verdict_line(good) == "success (probability 0.90)"
+
+
+def test_figures_have_units(result):
+    told = summary.figures(result)
+    degrees = np.degrees(Rotation.from_matrix(result.rotation).magnitude())
+    assert told["rotation"] == f"{degrees:.3f} deg"
+    # The largest standard deviations: 2e-3 rad and 0.03.
+    assert told["one sigma"] == f"{np.degrees(2e-3):.2g} deg, 0.03"
+    assert told["weak directions"] == "one\nanother"
+    assert told["translation"] == "1000000, -2, 0.5"
+
+
+def test_nothing_is_claimed_without_a_refinement(result):
+    told = summary.figures(result._replace(covariance=np.full((6, 6), np.nan), weak_directions=()))
+    assert told["one sigma"] == told["weak directions"] == summary._UNKNOWN
+    exact = summary.figures(result._replace(covariance=np.zeros((6, 6)), weak_directions=()))
+    assert (exact["one sigma"], exact["weak directions"]) == ("0 deg, 0", "none")
+
+
+def test_record_is_json_and_reads_back(result):
+    text = json.dumps(summary.record(result), allow_nan=False)
+    read = json.loads(text)
+    assert read["evidence"] == {
+        "overlap": 0.6, "smaller": 0.5, "gap": None, "facing": 0.0, "constraint": 0.3, "rival": 0.2,
+    }  # fmt: skip
+    np.testing.assert_array_equal(read["rotation"], result.rotation)
+    assert read["weak_directions"] == ["one", "another"]
+    assert read["mean_confidence"] == 0.5
+    assert "confidence" not in read
+
+
+def test_matrix_text_keeps_twelve_digits_aligned(seed):
+    matrix = np.random.default_rng(seed).normal(size=(4, 4)) * 10.0 ** np.array([0, -7, 3, 6])
+    lines = summary.matrix_text(matrix).splitlines()
+    np.testing.assert_allclose(
+        [[float(x) for x in line.split()] for line in lines], matrix, rtol=1e-11
+    )
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi])
+def test_axis_angle_is_the_rotation(seed, angle):
+    axis = np.random.default_rng(seed).normal(size=3)
+    axis /= np.linalg.norm(axis)
+    rotation = Rotation.from_rotvec(angle * axis).as_matrix()
+    found, size = summary.axis_angle(rotation)
+    assert size == pytest.approx(angle, abs=1e-12)
+    assert np.linalg.norm(found) == pytest.approx(1)
+    np.testing.assert_allclose(Rotation.from_rotvec(size * found).as_matrix(), rotation, atol=1e-12)
