@@ -1,14 +1,15 @@
-"""The frame that every refinement solves in: both clouds centred, lengths near 1.
+"""The frame that every solver works in: both clouds centred, lengths near 1.
 
 Solving at the original offset would lose the digits that the offset takes, and a damping or a step
-limit only means something when rotation and translation are of one size.
+limit only means something when rotation and translation are of one size. `enter` is for arrays on a
+device; on the host `Frame` is made of the centres and radii of two clouds (`measure`), in float64.
+The unit is the same: the root mean square of the two radii.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import rigid
@@ -18,11 +19,11 @@ from jaxreg.types import RigidTransform
 
 
 class Frame(NamedTuple):
-    """Where the two clouds were taken from: ``x = centre + length x'``."""
+    """Where the two clouds were taken from: ``x = centre + length x'``. JAX or numpy arrays."""
 
-    source_centre: Float[Array, "3"]
-    reference_centre: Float[Array, "3"]
-    length: Float[Array, ""]
+    source_centre: Float[Array, "3"] | Float[np.ndarray, "3"]
+    reference_centre: Float[Array, "3"] | Float[np.ndarray, "3"]
+    length: Float[Array, ""] | float
 
 
 def enter(
@@ -50,20 +51,34 @@ def enter(
 
 def transform_in(frame: Frame, transform: RigidTransform | None) -> RigidTransform:
     """A transform of the original clouds (None: the identity) as one of the clouds in the frame."""
-    dtype = frame.length.dtype
     if transform is None:
-        transform = rigid.identity(dtype)
-    rotation = jnp.asarray(transform.rotation, dtype)
-    rotated = jnp.matmul(rotation, frame.source_centre, precision=Precision.HIGHEST)
-    shift = jnp.asarray(transform.translation, dtype) + rotated - frame.reference_centre
-    return RigidTransform(rotation, shift / frame.length)
+        transform = rigid.identity(frame.source_centre.dtype)
+    if not isinstance(frame.source_centre, np.ndarray):  # float64 stays what it is on the host
+        dtype = frame.source_centre.dtype
+        transform = RigidTransform(*(jnp.asarray(part, dtype) for part in transform))
+    shift = transform.translation + _rotated(transform, frame) - frame.reference_centre
+    return RigidTransform(transform.rotation, shift / frame.length)
 
 
 def transform_out(frame: Frame, transform: RigidTransform) -> RigidTransform:
     """The inverse of `transform_in`."""
-    rotated = jnp.matmul(transform.rotation, frame.source_centre, precision=Precision.HIGHEST)
     shift = transform.translation * frame.length + frame.reference_centre
-    return RigidTransform(transform.rotation, shift - rotated)
+    return RigidTransform(transform.rotation, shift - _rotated(transform, frame))
+
+
+def measure(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """Centroid and root mean square radius of a cloud on the host, in float64.
+
+    The radius is 0 where the spread is no more than the rounding of the offset.
+    """
+    # By way of one of the points, so that a common offset costs no digits.
+    centre = points[0] + (points - points[0]).mean(axis=0)
+    columns = (points - centre).T
+    largest = max(float(np.abs(column).max()) for column in columns)
+    if largest <= 16 * np.finfo(np.float64).eps * np.abs(centre).max():
+        return centre, 0.0
+    mean_square = sum(float(np.mean((column / largest) ** 2)) for column in columns)
+    return centre, largest * mean_square**0.5
 
 
 def check_clouds(source: Array, reference: Array) -> None:
@@ -74,6 +89,11 @@ def check_clouds(source: Array, reference: Array) -> None:
                 f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, "
                 "and use jax.vmap for a batch."
             )
+
+
+def _rotated(transform: RigidTransform, frame: Frame):
+    """``R c`` of the source's centre: the same sum in numpy and in JAX, in full precision."""
+    return (transform.rotation * frame.source_centre[None, :]).sum(axis=-1)
 
 
 def _centred(points: Array, mask: Array | None) -> tuple[Array, Array]:
@@ -89,46 +109,3 @@ def _mean_square(points: Array, mask: Array | None) -> Array:
 def _count(points: Array, mask: Array | None) -> Array:
     count = points.shape[0] if mask is None else jnp.sum(mask)
     return jnp.maximum(jnp.asarray(count, points.dtype), 1)
-
-
-def common_frame(source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"]) -> Frame:
-    """Centres and one common unit: the larger of the two clouds' root mean square radii.
-
-    The unit is 1 where all points of both clouds coincide.
-    """
-    centres = [_mean(points) for points in (source, reference)]
-    radii = [_radius(p - c) for p, c in zip((source, reference), centres, strict=True)]
-    length = max(radii)
-    # Below this the spread is the rounding of the offset, and no shape.
-    noise = 16 * np.finfo(np.float64).eps * max(np.abs(source).max(), np.abs(reference).max())
-    return Frame(*centres, length if length > noise else 1.0)
-
-
-def pose_in(frame: Frame, pose: RigidTransform) -> RigidTransform:
-    """A pose of the original clouds as one of the scaled clouds."""
-    shift = pose.rotation @ frame.source_centre + pose.translation - frame.reference_centre
-    return RigidTransform(pose.rotation, shift / frame.length)
-
-
-def pose_out(frame: Frame, pose: RigidTransform) -> RigidTransform:
-    """The inverse of `pose_in`."""
-    shift = pose.translation * frame.length + frame.reference_centre
-    return RigidTransform(pose.rotation, shift - pose.rotation @ frame.source_centre)
-
-
-def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation nearest to a matrix, orthogonal to float64."""
-    u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def _mean(points: np.ndarray) -> np.ndarray:
-    """Mean of the rows, by way of one of them, so that a common offset costs no digits."""
-    return points[0] + (points - points[0]).mean(axis=0)
-
-
-def _radius(centred: np.ndarray) -> float:
-    largest = np.abs(centred).max()
-    if largest == 0:
-        return 0.0
-    return float(largest * np.sqrt(np.mean(np.sum((centred / largest) ** 2, axis=1))))

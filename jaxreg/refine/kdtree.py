@@ -5,49 +5,71 @@ or `gicp`, jitted. Arrays are padded to a few sizes, so that a new size of cloud
 """
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
+from jaxreg.geometry.clouds import padded_size
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs
 from jaxreg.refine.gicp import gicp_step
 from jaxreg.refine.point_to_plane import point_to_plane_step
 from jaxreg.refine.point_to_point import point_to_point_step
-from jaxreg.refine.robust import Weighting
+from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import RigidTransform
 
-Method = Literal["icp", "point_to_plane", "gicp"]
-
 _COARSE = 30_000
-"""Points of a cloud that find the pose before all of them polish it."""
-_SMALLEST = 256
-"""Smallest padded size: below, one compilation more costs more than the padding."""
+"""Points of a cloud that find the pose before all of them refine it."""
+_SMALLEST = 512
+"""Smallest padded size: below, one more compilation costs more than the padding."""
 
 
 class IndexedCloud(NamedTuple):
-    """A cloud on the host with its tree, and on the device, padded, with its normals and edges."""
+    """A cloud on the host with its tree, and on the device, padded, with its normals and edges.
 
-    points: np.ndarray
+    Coordinates times `scale` are those in the frame of a pair: a cloud is indexed once, in its own
+    unit, and placed in many frames.
+    """
+
+    points: Float[np.ndarray, "n 3"]
     tree: cKDTree
-    padded: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    edge_normals: Float[Array, "n 3"]
+    padded: Float[Array, "m 3"]
+    normals: Float[Array, "m 3"]
+    edge_normals: Float[Array, "m 3"]
+    scale: float = 1.0
+
+    @property
+    def host_normals(self) -> Float[np.ndarray, "n 3"]:
+        """The normals of `points`, float64."""
+        return np.asarray(self.normals, np.float64)[: len(self.points)]
+
+    def nearest(
+        self, queries: Float[np.ndarray, "q 3"]
+    ) -> tuple[Float[np.ndarray, "q"], np.ndarray]:
+        """Distance to, and index of, the nearest point of every query, both in the frame."""
+        distance, index = self.tree.query(queries / self.scale, workers=-1)
+        return np.asarray(distance) * self.scale, np.asarray(index)
 
 
-def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
-    """Tree, normals and edges of a cloud (n, 3)."""
+def index_cloud(
+    points: Float[np.ndarray, "n 3"], *, k: int, normals: Float[np.ndarray, "n 3"] | None = None
+) -> IndexedCloud:
+    """Tree, normals (of `k` neighbours, unless given) and edges of a cloud; fewer where it is small."""
     tree = cKDTree(points)
+    found = min(k, len(points) - 1) + 1
     # One more than asked for: the point finds itself, and a row of its own index does not count.
-    _, index = tree.query(points, k=neighbors + 1, workers=-1)
-    size = padded_size(len(points))
-    rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
-    rows[: len(points)] = index
-    padded = jax.device_put(np.pad(points, ((0, size - len(points)), (0, 0))))
-    return IndexedCloud(points, tree, padded, *_normals(padded, rows))
+    _, index = tree.query(points, k=list(range(1, found + 1)), workers=-1)
+    size = padded_size(len(points), smallest=_SMALLEST)
+    rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, k + 1)).copy()
+    rows[: len(points), :found] = index
+    fill = ((0, size - len(points)), (0, 0))
+    padded = jax.device_put(np.pad(points, fill))
+    given = None if normals is None else jax.device_put(np.pad(normals, fill))
+    return IndexedCloud(points, tree, padded, *_described(padded, rows, given))
 
 
 def iterate(
@@ -55,35 +77,28 @@ def iterate(
     source: IndexedCloud,
     reference: IndexedCloud,
     weighting: Weighting,
-    widths: np.ndarray,
     *,
-    method: Method,
-    thickness: float,
-    edges: bool,
-    both_directions: bool,
-    tolerance: float,
+    config: RefineConfig,
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    `widths` are the widenings of the kernel, 1 the last. Where a step is below `tolerance` half of
-    the remaining ones are skipped, and at width 1 all are. Large clouds first converge with every
-    k-th point.
+    The kernel narrows to its final width. Where a step is below `config.tolerance` half of the
+    remaining widths are skipped, and at the final width all are. Large clouds first converge with
+    every k-th point.
     """
+    widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
         i, converged = 0, False
         while i < len(widths) and not converged:
-            pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
-            new = _step(
-                pose, source[2:], reference[2:], pairs,
-                weighting.scale, weighting.max_distance, float(widths[i]),
-                kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
-                edges=edges,
-            )  # fmt: skip
+            pairs = tree_pairs(
+                pose, source, reference, stride, both_directions=config.both_directions
+            )
+            new = _step(pose, source[2:], reference[2:], pairs, weighting[1:3], widths[i], config=config)
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
-            still = _change(pose, new) < tolerance
+            still = _change(pose, new) < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + len(widths)) // 2, len(widths) - 1)
@@ -102,15 +117,18 @@ def tree_pairs(
     """`closest_pairs` of every `stride`-th point, padded, by the trees of the unmoved clouds."""
     rotation, translation = pose
     rows = np.arange(0, len(source.points), stride)
-    moved = source.points[rows] @ rotation.T + translation
-    source_index, reference_index = rows, reference.tree.query(moved, workers=-1)[1]
+    moved = source.points[rows] @ (rotation.T * source.scale) + translation
+    size = padded_size(len(rows), smallest=_SMALLEST)
+    source_index, reference_index = rows, reference.nearest(moved)[1]
     if both_directions:
         rows = np.arange(0, len(reference.points), stride)
-        back = (reference.points[rows] - translation) @ rotation
-        source_index = np.concatenate([source_index, source.tree.query(back, workers=-1)[1]])
+        back = (reference.points[rows] * reference.scale - translation) @ rotation
+        source_index = np.concatenate([source_index, source.nearest(back)[1]])
         reference_index = np.concatenate([reference_index, rows])
+        # A sum of two sizes, so that the sizes of the clouds alone decide on the program.
+        size += padded_size(len(rows), smallest=_SMALLEST)
     count = len(source_index)
-    padding = (0, padded_size(count) - count)
+    padding = (0, size - count)
     return Pairs(
         np.pad(source_index, padding).astype(np.int32),
         np.pad(reference_index, padding).astype(np.int32),
@@ -118,38 +136,31 @@ def tree_pairs(
     )
 
 
-def padded_size(count: int) -> int:
-    """The next of 256, 320, 384, 448, 512, 640 ...: at most a quarter of padding above 256."""
-    unit = 1 << max((count - 1).bit_length() - 3, 0)
-    return max(-(-count // unit) * unit, _SMALLEST)
-
-
 @jax.jit
-def _normals(points, neighbors):
-    across = normals(points, neighbors)
+def _described(points, neighbors, given):
+    across = normals(points, neighbors) if given is None else given
     return across, edge_normals(points, neighbors, across)
 
 
-_STATIC = ("kernel", "trim", "method", "thickness", "edges")
-
-
-@partial(jax.jit, static_argnames=_STATIC)
-def _step(
-    pose, source, reference, pairs, scale, max_distance, width, *,
-    kernel, trim, method, thickness, edges,
-):  # fmt: skip
-    (x, *source_surface), (y, *reference_surface) = source, reference
-    weighting = Weighting(kernel, scale, max_distance, trim)
+@partial(jax.jit, static_argnames="config")
+def _step(pose, source, reference, pairs, scale_and_distance, width, *, config: RefineConfig):
+    x, source_normals, source_edges, source_scale = source
+    y, reference_normals, reference_edges, reference_scale = reference
+    x, y = x * source_scale, y * reference_scale
+    weighting = Weighting(config.kernel, *scale_and_distance, config.trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
-    if method == "icp":
+    if config.method == "icp":
         return point_to_point_step(pose, x, y, pairs, weighting, width)
-    if method == "point_to_plane":
-        return point_to_plane_step(pose, x, y, reference_surface[0], pairs, weighting, width)
-    covariances = [
-        surface_covariances(across, thickness, ends if edges else None)
-        for across, ends in (source_surface, reference_surface)
-    ]
-    return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=thickness)
+    if config.method == "point_to_plane":
+        return point_to_plane_step(pose, x, y, reference_normals, pairs, weighting, width)
+    covariances = (
+        surface_covariances(across, config.epsilon, ends if config.edges else None)
+        for across, ends in (
+            (source_normals, source_edges),
+            (reference_normals, reference_edges),
+        )
+    )
+    return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=config.epsilon)
 
 
 def _change(old: RigidTransform, new: RigidTransform) -> float:

@@ -2,52 +2,68 @@
 
 import dataclasses
 import functools
-import time
+import math
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
-from jaxreg import _xla
-from jaxreg.geometry import clouds, frame
-from jaxreg.refine.host import Refined
-from jaxreg.refine.host import refine as refine_pose
-from jaxreg.refine.kdtree import IndexedCloud, index_cloud
-from jaxreg.refine.uncertainty import PoseUncertainty, about, weak_directions
+from jaxreg.geometry import frame
+from jaxreg.geometry.clouds import check_pose, padded_size
+from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
+from jaxreg.refine.host import Refined, in_units, refine_indexed, unrefined
+from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
 from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
-from jaxreg.search.learned import load_network
-from jaxreg.search.pipeline import search_poses
+from jaxreg.scans.prepare import Prepared
+from jaxreg.search.learned import load_features
+from jaxreg.search.pipeline import search_described
 from jaxreg.types import RigidTransform
 
-Rotation = Literal["limited", "full"]
-Refinement = Literal["gicp", "icp", "point_to_plane"]
-
-_DEFAULT = RegisterConfig()
 _SMALLEST = 512
 """Smallest size of a padded cloud in the search."""
-_PREFERENCE = 0.01
-"""What half a turn costs in the choice of a pose: of those that agree equally (a symmetric shape)
-the one that turns least is taken."""
+_TURN_COST = 0.01
+"""What half a turn costs in the choice of a pose, in units of the search's score: of poses that agree
+equally (a symmetric shape) the one that turns least is taken."""
+_RIVAL_DEG, _RIVAL_DISTANCE = 15.0, 0.2
+"""A pose that turns by more than this from the chosen one, or moves the source's centroid farther away
+(in the unit of the frame), is another pose and no variant of it."""
+_ANGLE_SLACK = 1e-2
+"""Radians by which a refined pose may exceed `max_rotation_deg`."""
 
 
-class ScanRegistration(NamedTuple):
+class Alternative(NamedTuple):
+    """Another pose that the search found: where it lays the source, and how much worse it agrees.
+
+    `lead` is in shares of the points; near 0, the two poses cannot be told apart.
+    """
+
+    transform: RigidTransform
+    lead: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScanRegistration:
     """Where the source lies in the frame of the reference, and how far that can be trusted.
 
-    float64, in the unit of the input, a row for every row of the source. `confidence[i]`, in
-    [0, 1], says how well point `i` agrees with the reference after alignment; `correspondences[i]`
-    is the reference point nearest to it there (NaN for a dropped point). `reach` is the distance
-    within which two points count as the same surface, taken from their spacing. `fitness` is the
-    share of the source within reach of the reference, `inlier_rmse` the root mean square distance
-    of those points, `overlap` the share of both clouds within reach of the other, at equal density.
+    float64, in the unit of the input, a row for every row of the source. `transformation` is the 4x4
+    form of (`rotation`, `translation`). `correspondences[i]` is the reference point nearest to source
+    point `i` after alignment (NaN for a dropped point), and `confidence[i]`, in [0, 1], says how near:
+    ``(1 - (d / max_correspondence_distance)^2)^2``. That distance, within which two points count as
+    the same surface, follows from their spacing. `fitness` is the share of the source's points within
+    it, `inlier_rmse` the root mean square distance of those, `overlap` the share of both clouds within
+    it of the other, at equal density.
+
+    `success` is False when the pose should not be trusted, and `reason` says why in a sentence;
+    `probability` is the calibrated chance that the pose is right, and `evidence` is what it is computed
+    from. `alternatives` are the other poses that the search found, the best first.
 
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
-    reference's distinct points; NaN where nothing was refined or no surfaces were within reach.
-    `weak_directions` names the motions that the clouds hardly resist. `success` is False when the
-    pose should not be trusted, `probability` is the calibrated chance that it is right. `evidence`
-    is what that chance is computed from. `dropped` counts the non-finite rows of both clouds.
+    reference's distinct points; NaN where nothing was refined or no surfaces were near each other.
+    `weak_directions` are the motions that the clouds hardly resist. `converged` says whether the last
+    step of the refinement was below its tolerance (None: not refined). `dropped` counts the non-finite
+    rows of both clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -55,17 +71,50 @@ class ScanRegistration(NamedTuple):
     transformation: Float[np.ndarray, "4 4"]
     confidence: Float[np.ndarray, "n"]
     correspondences: Float[np.ndarray, "n 3"]
-    reach: float
-    fitness: float
-    inlier_rmse: float
-    overlap: float
-    covariance: Float[np.ndarray, "6 6"]
-    weak_directions: tuple[str, ...]
     success: bool
     probability: float
+    reason: str
+    overlap: float
+    fitness: float
+    inlier_rmse: float
+    max_correspondence_distance: float
+    covariance: Float[np.ndarray, "6 6"]
+    weak_directions: tuple[WeakDirection, ...]
+    alternatives: tuple[Alternative, ...]
     evidence: verdict.Evidence
-    seconds: float
+    converged: bool | None
     dropped: int
+
+    @property
+    def transform(self) -> RigidTransform:
+        """Rotation and translation, from source to reference."""
+        return RigidTransform(self.rotation, self.translation)
+
+
+class _Problem(NamedTuple):
+    """Two prepared clouds in one frame; `distance` is that within which points count as the same."""
+
+    source: Prepared
+    reference: Prepared
+    where: frame.Frame
+    levels: tuple[prepare.Level, prepare.Level]
+    spacing: float
+    distance: float
+    config: RegisterConfig
+
+    def placed(self) -> tuple[tuple[prepare.Level, float], tuple[prepare.Level, float]]:
+        """Both levels, each with its scale in the frame."""
+        source, reference = self.levels
+        length = float(self.where.length)
+        return (source, self.source.radius / length), (reference, self.reference.radius / length)
+
+
+class _Found(NamedTuple):
+    """A pose in the frame, how much better it is than the next that differs, and the others."""
+
+    pose: RigidTransform
+    rival: float
+    alternatives: tuple[Alternative, ...]
 
 
 def register(
@@ -73,224 +122,201 @@ def register(
     reference: object,
     *,
     initial: object = None,
-    rotation: Rotation = "full",
-    refine: Refinement | None = "gicp",
+    max_rotation_deg: float | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
-    config: RegisterConfig = _DEFAULT,
+    config: RegisterConfig | None = None,
 ) -> ScanRegistration:
     """The rigid transform ``y = R x + t`` that lays `source` on `reference`, with a verdict.
 
-    Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit; neither their sizes nor
-    their order nor their origin play a role. `initial` (4x4 or a `RigidTransform`) starts from a
-    known pose and skips the search, so that nothing is known of rival poses. `rotation` says how far
-    the clouds may be turned: "full" by anything, "limited" by `config.limited_deg`, which settles
-    symmetric shapes. `refine` None gives the pose of the search, or `initial`. The same input gives
-    the same bits.
+    Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit, or what `jaxreg.prepare`
+    made of them; neither their sizes nor their order nor their origin play a role. `initial` (4x4 or
+    a `RigidTransform`) starts from a known pose and skips the search, so that nothing is known of rival
+    poses. `max_rotation_deg` says how far the clouds may be turned at most (None: by anything), which
+    settles symmetric shapes. The same input gives the same bits.
 
     Raises:
       ValueError: a cloud is not numeric (n, 3) with three finite points or more (the message names
-        the row), `initial` is no rigid transform, or an option is unknown.
+        the row), `initial` is not a rigid transform, an option makes no sense, or a cloud was prepared
+        with another configuration.
     """
-    begin = time.perf_counter()
-    _check_options(rotation, refine, config)
-    start = None if initial is None else _check_initial(initial)
-    moving = prepare.make_scan(source, "source", nonfinite=nonfinite)
-    fixed = prepare.make_scan(reference, "reference", nonfinite=nonfinite)
-    where = frame.common_frame(moving.points, fixed.points)
-    x = (moving.points - where.source_centre) / where.length
-    y = (fixed.points - where.reference_centre) / where.length
-    a, b, spacing = prepare.at_one_density(x, y, config.search_points)
+    config = RegisterConfig() if config is None else config
+    _check_options(max_rotation_deg, config)
+    start = None if initial is None else check_pose(initial, "initial")
+    clouds = (
+        _prepared(cloud, name, nonfinite, config)
+        for cloud, name in ((source, "source"), (reference, "reference"))
+    )
+    problem = _pose_problem(*clouds, config)
     if start is None:
-        pose, rival = _searched(a, b, where, rotation, config)
+        found = _search(problem, max_rotation_deg)
     else:
-        pose, rival = frame.pose_in(where, start), verdict.NOT_SEARCHED
-    refined = _refined(x, y, pose, refine, spacing, config)
-    clouds = (_indexed(points, config) for points in (a, b))
-    reach = config.reach * spacing
-    judged = verdict.evidence(refined.transform, *clouds, reach, rival=rival)
-    return _result(x, y, moving, fixed, where, refined, judged, reach, begin)
+        found = _Found(frame.transform_in(problem.where, start), verdict.NOT_SEARCHED, ())
+    refined = _refine(problem, found.pose)
+    judged = verdict.evidence(
+        refined.transform, *problem.placed(), problem.distance, rival=found.rival
+    )
+    return _result(problem, refined, judged, found.alternatives)
 
 
-def _indexed(points: np.ndarray, config: RegisterConfig) -> IndexedCloud:
-    return index_cloud(_enough(points, config), neighbors=config.refine_neighbors)
-
-
-def _enough(points: np.ndarray, config: RegisterConfig) -> np.ndarray:
-    """The points, all of them as often as normals need it."""
-    return np.tile(points, (-(-(config.refine_neighbors + 1) // len(points)), 1))
-
-
-_UNREFINED = PoseUncertainty(
-    np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(()), np.zeros(()), np.zeros(3), np.ones(())
-)
-_LEAST = {
-    "search_points": 16,
-    "refine_points": 16,
-    "refine_iterations": 1,
-    "refine_anneal": 1,
-    "refine_neighbors": 2,
-}
+_LEAST = {"search_points": 16, "refine_points": 16}
 """The smallest sensible value of these settings; the others must be positive."""
 
 
-def _check_options(rotation: str, refine: str | None, config: RegisterConfig) -> None:
-    for name, value in dataclasses.asdict(config).items():
-        if isinstance(value, bool):
-            continue
-        least = _LEAST.get(name, 0)
+def _check_options(max_rotation_deg: float | None, config: RegisterConfig) -> None:
+    for name in ("search_points", "refine_points", "inlier_spacings", "refine_spacings"):
+        value, least = getattr(config, name), _LEAST.get(name, 0)
         if not (least <= value < np.inf and value > 0):
             bound = f"at least {least}" if least else "positive"
             raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
-    if config.limited_deg > 180:
+    if max_rotation_deg is not None and not 0 < max_rotation_deg <= 180:
         raise ValueError(
-            f"config.limited_deg must be at most 180, got {config.limited_deg}: choose "
-            "rotation='full' for clouds that may be turned by anything."
+            f"max_rotation_deg must be above 0 and at most 180, got {max_rotation_deg}: leave it out "
+            "for clouds that may be turned by anything."
         )
-    if rotation not in ("limited", "full"):
-        raise ValueError(f"rotation must be 'limited' or 'full', got {rotation!r}.")
-    if refine not in ("gicp", "icp", "point_to_plane", None):
-        raise ValueError(f"refine must be 'gicp', 'icp', 'point_to_plane' or None, got {refine!r}.")
 
 
-def _check_initial(initial: object) -> RigidTransform:
-    if isinstance(initial, RigidTransform):
-        rotation, translation = (np.asarray(part, np.float64) for part in initial)
-    else:
-        try:
-            matrix = np.asarray(initial, np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(
-                "initial is no array of numbers: give a 4x4 matrix [[R, t], [0, 1]]."
-            ) from None
-        if matrix.shape != (4, 4):
-            raise ValueError(f"initial must be a 4x4 matrix [[R, t], [0, 1]], got {matrix.shape}.")
-        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-            raise ValueError(
-                f"the last row of initial is {matrix[3].tolist()}: give a matrix [[R, t], [0, 1]] "
-                "(this one may be transposed)."
-            )
-        rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        raise ValueError("initial holds NaN or infinity: give a finite transform.")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+def _prepared(cloud: object, name: str, nonfinite, config: RegisterConfig) -> Prepared:
+    if not isinstance(cloud, Prepared):
+        return prepare.prepare(cloud, nonfinite=nonfinite, config=config, name=name)
+    if cloud.config != config:
         raise ValueError(
-            "initial is no rigid transform (its 3x3 part must be a rotation: orthogonal, det +1): "
-            "remove scale, shear and mirroring."
+            f"{name} was prepared with another configuration than this registration's: give "
+            "jaxreg.prepare and jaxreg.register the same config."
         )
-    return RigidTransform(frame.nearest_rotation(rotation), translation)
+    return cloud
 
 
-def _searched(
-    x: np.ndarray, y: np.ndarray, where: frame.Frame, rotation: Rotation, config: RegisterConfig
-) -> tuple[RigidTransform, float]:
+def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) -> _Problem:
+    length = math.hypot(source.radius, reference.radius) / math.sqrt(2)
+    where = frame.Frame(source.centre, reference.centre, length)
+    levels = prepare.at_one_density(source, reference)
+    sides = zip(levels, (source, reference), strict=True)
+    spacing = max(prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides))
+    distance = config.inlier_spacings * spacing
+    return _Problem(source, reference, where, levels, spacing, distance, config)
+
+
+def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
     """The most plausible pose, and how much more plausible it is than the next that differs."""
-    size = clouds.bucket(max(len(x), len(y)), smallest=_SMALLEST, largest=config.search_points)
-    unmoved = frame.pose_in(where, RigidTransform(np.eye(3), np.zeros(3)))
-    largest = 180.0 if rotation == "full" else config.limited_deg
-    poses, score = _search(config.learned)(
-        *clouds.padded(x, size),
-        *clouds.padded(y, size),
-        # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
-        RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved)),
-        np.float32(np.radians(largest)),
-    )
-    poses, score = RigidTransform(*(np.asarray(p, np.float64) for p in poses)), np.asarray(score)
-    best = int(np.argmax(score - _PREFERENCE * _angles(poses, np.eye(3)) / np.pi))
+    where, most = problem.where, math.radians(max_rotation_deg or 180.0)
+    poses, score = _searched_poses(problem, most)
+    turned = np.radians(rotation_angle_deg(poses.rotation, np.eye(3)[None]))
+    allowed = (turned <= most + _ANGLE_SLACK) & np.isfinite(score)
+    # Where no pose is allowed, the best of the others is at least an answer.
+    allowed = allowed if allowed.any() else np.isfinite(score)
+    best = int(np.argmax(np.where(allowed, score, -np.inf) - _TURN_COST * turned / np.pi))
     apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
-    others = (_angles(poses, poses.rotation[best]) > np.radians(15)) | (apart > 0.2)
-    # A pose that turns too far is no rival: it was ruled out, and its score says only that.
-    allowed = _angles(poses, np.eye(3)) <= np.radians(largest) + 1e-2
-    others &= allowed | ~allowed[best]
-    lead = score[best] - score[others].max() if others.any() else verdict.NO_RIVAL
-    return RigidTransform(poses.rotation[best], poses.translation[best]), float(lead)
+    angle = rotation_angle_deg(poses.rotation, poses.rotation[best][None])
+    # A pose that turns too far is no rival: it was ruled out.
+    others = allowed & ((angle > _RIVAL_DEG) | (apart > _RIVAL_DISTANCE))
+    rival = float(score[best] - score[others].max()) if others.any() else verdict.NO_RIVAL
+    alternatives = tuple(
+        Alternative(frame.transform_out(where, _nth(poses, i)), float(score[best] - score[i]))
+        for i in np.flatnonzero(others)
+    )
+    return _Found(_nth(poses, best), rival, alternatives)
+
+
+def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.ndarray]:
+    """The poses of the search in the frame of the pair, in float64, and their scores."""
+    where, config = problem.where, problem.config
+    # Twice the radius: a usual shape then fills the unit sphere.
+    unit = prepare.in_steps(2 * float(where.length))
+    size = padded_size(max(len(level.points) for level in problem.levels), smallest=_SMALLEST)
+    described = (
+        level.described(unit / cloud.radius, size, config.search)
+        for level, cloud in zip(problem.levels, (problem.source, problem.reference), strict=True)
+    )
+    unmoved = frame.transform_in(where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3)))
+    # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
+    also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
+    found = _program(config)(*described, also, np.float32(most))
+    poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
+    scale = unit / float(where.length)
+    return poses._replace(translation=poses.translation * scale), np.asarray(found.score)
 
 
 @functools.cache
-def _search(learned: bool):
-    def run(network, x, x_mask, y, y_mask, also, largest_angle):
-        return search_poses(
-            x,
-            y,
-            source_mask=x_mask,
-            reference_mask=y_mask,
-            network=network,
-            also=also,
-            largest_angle=largest_angle,
+def _program(config: RegisterConfig):
+    def run(network, source, reference, also, max_angle):
+        return search_described(
+            source, reference, network=network, also=also, max_angle=max_angle, config=config.search
         )
 
-    network = jax.device_put(load_network()) if learned else None
-    return functools.partial(_xla.jit(run), network)
+    network = jax.device_put(load_features()) if config.learned else None
+    return functools.partial(jax.jit(run), network)
 
 
-def _angles(poses: RigidTransform, rotation: np.ndarray) -> Float[np.ndarray, "p"]:
-    """By how much every pose turns from `rotation`, in [0, pi]."""
-    chord = np.linalg.norm(poses.rotation - rotation, axis=(1, 2)) / np.sqrt(8)
-    return 2 * np.arcsin(np.minimum(chord, 1))
+def _nth(poses: RigidTransform, i: int) -> RigidTransform:
+    return RigidTransform(nearest_rotation(poses.rotation[i]), poses.translation[i])
 
 
-def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> Refined:
-    """The pose refined with more points than the search had; without a method as it is."""
-    if method is None:
-        rotation = frame.nearest_rotation(pose.rotation)
-        return Refined(RigidTransform(rotation, pose.translation), 0, None, _UNREFINED)
-    x, y = (_enough(prepare.reduce_to(p, config.refine_points), config) for p in (x, y))
-    finer = min(spacing, max(prepare.spacing(x), prepare.spacing(y), prepare.FINEST))
-    return refine_pose(
-        x,
-        y,
-        method=method,
-        initial=pose,
-        iterations=config.refine_iterations,
-        max_distance=config.refine_reach * finer,
-        anneal=config.refine_anneal,
-        both_directions=True,
-        neighbors=config.refine_neighbors,
-        thickness=config.refine_thickness,
-        edges=config.refine_edges,
-        dense_limit=0,
-    )
+def _refine(problem: _Problem, pose: RigidTransform) -> Refined:
+    """The pose refined with more points than the search had; or as it is."""
+    config = problem.config
+    if config.refine is None:
+        return unrefined(pose)
+    source, reference, where = problem.source, problem.reference, problem.where
+    clouds = [cloud.in_frame(cloud.fine, where) for cloud in (source, reference)]
+    given = config.refine.max_correspondence_distance
+    if math.isfinite(given):
+        distance = given / float(where.length)
+    else:
+        spacings = (c.fine.spacing * c.radius / float(where.length) for c in (source, reference))
+        distance = config.refine_spacings * min(problem.spacing, max(prepare.FINEST, *spacings))
+    return refine_indexed(*clouds, initial=pose, distance=distance, config=config.refine)
 
 
 def _result(
-    x: np.ndarray,
-    y: np.ndarray,
-    moving: prepare.Scan,
-    fixed: prepare.Scan,
-    where: frame.Frame,
+    problem: _Problem,
     refined: Refined,
     judged: verdict.Evidence,
-    reach: float,
-    begin: float,
+    alternatives: tuple[Alternative, ...],
 ) -> ScanRegistration:
-    inner = refined.transform
-    pose = frame.pose_out(where, inner)
-    distance, index = prepare.nearest(cKDTree(y), x @ inner.rotation.T + inner.translation)
-    near = distance <= reach
-    confidence = np.maximum(0, 1 - (distance / reach) ** 2) ** 2
-    units = np.repeat([1.0, where.length], 3)
+    source, where = problem.source, problem.where
+    length = float(where.length)
+    pose = frame.transform_out(where, refined.transform)
+    near, nearest = _nearest(problem, refined.transform)
+    inside = near <= problem.distance
+    confidence = np.maximum(0, 1 - (near / problem.distance) ** 2) ** 2
+    correspondences = problem.reference.points[nearest] * problem.reference.radius
     chance = verdict.probability(judged)
-    known = refined.uncertainty.weight > 0
-    centroid = np.zeros(3)  # of the whole reference, in the frame
-    covariance = (
-        about(refined.uncertainty, centroid).covariance if known else np.full((6, 6), np.nan)
-    )
+    uncertainty = in_units(refined.uncertainty, where)
+    weak = weak_directions(uncertainty)
     return ScanRegistration(
         rotation=pose.rotation,
         translation=pose.translation,
         transformation=np.block([[pose.rotation, pose.translation[:, None]], [0, 0, 0, 1]]),
-        confidence=prepare.per_input_row(moving, confidence, missing=0.0),
-        correspondences=prepare.per_input_row(moving, fixed.points[index], missing=np.nan),
-        reach=reach * where.length,
-        fitness=float(np.mean(near[moving.row])),
-        inlier_rmse=float(np.sqrt(np.mean(distance[near] ** 2)) * where.length)
-        if near.any()
-        else 0,
-        overlap=judged.overlap,
-        covariance=covariance * np.outer(units, units),
-        weak_directions=tuple(d.name for d in weak_directions(refined.uncertainty)),
+        confidence=source.per_input_row(confidence, missing=0.0),
+        correspondences=source.per_input_row(
+            correspondences + problem.reference.centre, missing=np.nan
+        ),
         success=chance >= verdict.TRUSTED,
         probability=chance,
+        reason=verdict.reason(judged, weak) if chance < verdict.TRUSTED else "",
+        overlap=judged.overlap,
+        fitness=float(np.mean(inside[source.row])),
+        inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
+        max_correspondence_distance=problem.distance * length,
+        covariance=_covariance(uncertainty, where),
+        weak_directions=weak,
+        alternatives=alternatives,
         evidence=judged,
-        seconds=time.perf_counter() - begin,
-        dropped=int(np.sum(~moving.kept) + np.sum(~fixed.kept)),
+        converged=refined.converged,
+        dropped=int(np.sum(~source.kept) + np.sum(~problem.reference.kept)),
     )
+
+
+def _nearest(problem: _Problem, pose: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
+    """Of every point of the source: distance, in the frame, to the nearest of the reference; which."""
+    source, reference, length = problem.source, problem.reference, float(problem.where.length)
+    moved = source.points @ (pose.rotation.T * (source.radius / length)) + pose.translation
+    near, index = prepare.nearest(reference.tree, moved * (length / reference.radius))
+    return near * (reference.radius / length), index
+
+
+def _covariance(uncertainty: PoseUncertainty, where: frame.Frame) -> Float[np.ndarray, "6 6"]:
+    """About the centroid of the reference; NaN where unknown."""
+    if not uncertainty.weight > 0:
+        return np.full((6, 6), np.nan)
+    return about(uncertainty, where.reference_centre).covariance

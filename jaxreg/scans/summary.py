@@ -1,5 +1,6 @@
 """A registration in words and figures: for the terminal, for the page, and for other programs."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,6 +10,8 @@ from jaxtyping import Float
 from jaxreg.scans.pair import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
+_CLOSE = 0.03
+"""Lead below which another pose is worth a word: that of a close call in the search."""
 _UNKNOWN = "not known: nothing was refined, or no surfaces are within reach"
 
 
@@ -30,12 +33,13 @@ def figures(result: ScanRegistration) -> dict[str, str]:
         "rotation": f"{angle:.3f} deg",
         "translation": ", ".join(f"{x:.9g}" for x in result.translation),
         "overlap": f"{result.overlap:.2f}",
-        "fitness": f"{result.fitness:.2f} within {result.reach:.4g}",
+        "fitness": f"{result.fitness:.2f} within {result.max_correspondence_distance:.4g}",
         "inlier rmse": f"{result.inlier_rmse:.4g}",
         "one sigma": f"{turn:.2g} deg, {shift:.2g}" if known else _UNKNOWN,
-        "weak directions": "\n".join(result.weak_directions) or ("none" if known else _UNKNOWN),
+        "weak directions": "\n".join(direction.name for direction in result.weak_directions) or ("none" if known else _UNKNOWN),
+        "converged": {True: "yes", False: "no", None: "not refined"}[result.converged],
+        "alternatives": _alternatives(result),
         "dropped points": str(result.dropped),
-        "time": f"{result.seconds:.2f} s",
     }
 
 
@@ -44,8 +48,22 @@ def record(result: ScanRegistration) -> dict[str, Any]:
 
     `mean_confidence` stands for the rows of `confidence`.
     """
-    values = {k: v for k, v in result._asdict().items() if k not in _PER_POINT}
+    values = {
+        field.name: getattr(result, field.name)
+        for field in dataclasses.fields(result)
+        if field.name not in _PER_POINT
+    }
     return _plain(values | {"mean_confidence": float(np.mean(result.confidence))})
+
+
+def _alternatives(result: ScanRegistration) -> str:
+    """How many other poses come near the chosen one, and the nearest of them."""
+    close = [other for other in result.alternatives if other.lead < _CLOSE]
+    if not close:
+        return "none that comes near"
+    turns = [axis_angle(other.transform.rotation @ result.rotation.T)[1] for other in close]
+    listed = ", ".join(f"turned by {math.degrees(turn):.0f} deg" for turn in turns)
+    return f"{len(close)} nearly as good ({listed} from this one)"
 
 
 def _plain(value: Any) -> Any:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.refine.kdtree import IndexedCloud
-from jaxreg.scans import prepare
+from jaxreg.refine.uncertainty import WeakDirection
+from jaxreg.scans.prepare import Level, agreement
 from jaxreg.types import RigidTransform
 
 TRUSTED = 0.5
@@ -38,55 +38,41 @@ class Evidence(NamedTuple):
 
 def evidence(
     pose: RigidTransform,
-    source: IndexedCloud,
-    reference: IndexedCloud,
-    reach: float,
+    source: tuple[Level, float],
+    reference: tuple[Level, float],
+    distance: float,
     *,
     rival: float,
 ) -> Evidence:
-    """The evidence for one pose, from every point of both clouds, which have one density."""
+    """The evidence for one pose, from every point of both clouds, which have one density.
+
+    Each cloud is a level and its scale in the frame of the pose; points within `distance` of the other
+    cloud, in the frame, count as the same surface.
+    """
     rotation, translation = pose
-    x, y = source.points, reference.points
-    x_normals, y_normals = _normals(source) @ rotation.T, _normals(reference)
-    moved, back = x @ rotation.T + translation, (y - translation) @ rotation
-    distance, index = prepare.nearest(reference.tree, moved)
-    other_distance, other_index = prepare.nearest(source.tree, back)
-    near, other_near = distance < reach, other_distance < reach
-    shares = near.mean(), other_near.mean()
-    there = _beside(moved[near], y[index[near]], x_normals[near], y_normals[index[near]])
-    back = _beside(
-        y[other_near], moved[other_index[other_near]],
-        y_normals[other_near], x_normals[other_index[other_near]],
-    )  # fmt: skip
-    across, cosine = (np.concatenate(parts) for parts in zip(there, back, strict=True))
-    own_across, own_cosine = (
-        np.concatenate(parts) for parts in zip(_own(source), _own(reference), strict=True)
+    x, y = (level.index._replace(scale=scale) for level, scale in (source, reference))
+    x_normals, y_normals = x.host_normals @ rotation.T, y.host_normals
+    fixed = y.points * y.scale
+    moved = x.points @ (rotation.T * x.scale) + translation
+    there, index = y.nearest(moved)
+    back, other_index = x.nearest((fixed - translation) @ rotation)
+    near, other_near = there < distance, back < distance
+    partner, other = index[near], other_index[other_near]
+    sides = (
+        agreement(moved[near], fixed[partner], x_normals[near], y_normals[partner]),
+        agreement(fixed[other_near], moved[other], y_normals[other_near], x_normals[other]),
     )
+    own = [(scale * across, cosine) for level, scale in (source, reference) for across, cosine in [level.own_agreement]]
+    across, cosine = (np.concatenate(parts) for parts in zip(*sides, strict=True))
+    own_across, own_cosine = (np.concatenate(parts) for parts in zip(*own, strict=True))
     return Evidence(
         overlap=float(np.mean(np.concatenate([near, other_near]))),
-        smaller=float(min(shares)),
-        gap=_median(across, reach) / max(_median(own_across, reach), 0.01 * reach),
+        smaller=float(min(near.mean(), other_near.mean())),
+        gap=_median(across, distance) / max(_median(own_across, distance), 0.01 * distance),
         facing=float(np.mean(cosine) - np.mean(own_cosine)) if len(cosine) else -1.0,
-        constraint=_constraint(moved[near], y_normals[index][near]),
+        constraint=_constraint(moved[near], y_normals[partner]),
         rival=float(rival),
     )
-
-
-def _normals(cloud: IndexedCloud) -> Float[np.ndarray, "n 3"]:
-    return np.asarray(cloud.normals, np.float64)[: len(cloud.points)]
-
-
-def _beside(x: np.ndarray, y: np.ndarray, x_normals: np.ndarray, y_normals: np.ndarray):
-    """Distances of points from their partners' planes, and cosines of the normals."""
-    across = np.abs(np.sum((x - y) * y_normals, axis=1))
-    return across, np.abs(np.sum(x_normals * y_normals, axis=1))
-
-
-def _own(cloud: IndexedCloud):
-    """The same between every point and its nearest neighbour in its own cloud."""
-    index = cloud.tree.query(cloud.points, k=2, workers=-1)[1][:, 1]
-    normals = _normals(cloud)
-    return _beside(cloud.points, cloud.points[index], normals, normals[index])
 
 
 def _median(values: np.ndarray, default: float) -> float:
@@ -117,6 +103,23 @@ def probability(found: Evidence) -> float:
     return float(1 / (1 + np.exp(-np.clip(score, -50, 50))))
 
 
+def reason(found: Evidence, weak: tuple[WeakDirection, ...]) -> str:
+    """Why a pose is not trusted: what of the evidence falls shortest of a usual right pose."""
+    if found.constraint < _LEAST_CONSTRAINT:
+        free = ", ".join(direction.name for direction in weak) or "a motion"
+        return f"The surfaces leave the pose free: {free}."
+    weights = _UNSEARCHED if np.isnan(found.rival) else _SEARCHED
+    short = weights[1:] * (features(found) - _USUAL[: len(weights) - 1])
+    return (
+        f"Only {found.overlap:.0%} of the points lie near the other cloud.",
+        f"Only {found.smaller:.0%} of one of the clouds lies near the other.",
+        f"The surfaces lie {found.gap:.1f} times as far apart as neighbouring points of one cloud.",
+        "The surfaces face different ways where they lie near each other.",
+        "The surfaces hardly resist a motion: " + (", ".join(d.name for d in weak) or "see sigma") + ".",
+        "Another pose agrees about as well (see alternatives).",
+    )[int(np.argmin(short))]
+
+
 def features(found: Evidence) -> Float[np.ndarray, "k"]:
     """The inputs of the regression; quantities that span decades by their logarithm.
 
@@ -136,6 +139,8 @@ def features(found: Evidence) -> Float[np.ndarray, "k"]:
 
 
 _LEAST_CONSTRAINT = 1e-5
+_USUAL = np.array([0.9, 0.85, 0.0, -0.05, -1.5, np.log10(0.15)])
+"""The features of a usual right pose, which `reason` compares with."""
 _SEARCHED = np.array([2.16, 1.21, 3.86, -2.89, 4.27, 2.06, 2.37])
 _UNSEARCHED = np.array([1.43, 1.19, 4.33, -3.04, 6.65, 3.13])
 """Intercept and coefficients, with and without a rival.
