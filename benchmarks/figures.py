@@ -31,11 +31,11 @@ from jaxreg.data.pairs import make_pair
 from jaxreg.data.procedural import shapes
 from jaxreg.evaluation import methods, metrics, run
 from jaxreg.geometry import rigid
+from jaxreg.io.log import read_metrics
 from jaxreg.network.matching import feature_distance, matching_maps, neighborhood_sum
 from jaxreg.network.model import iterate, neighborhood_graph, point_features
 from jaxreg.types import Pair
 from jaxreg.view import pictures
-from jaxreg.weights import checkpoint
 from jaxreg.weights.released import load_pretrained
 
 CLEAN = PairConfig(points=1024, kept=768)
@@ -221,7 +221,7 @@ def draw_drift(options: Options, path: Path) -> None:
     figure = Figure(figsize=(12, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for folder in options.runs:
-        columns = checkpoint.read_metrics(Path(folder) / "metrics.jsonl")
+        columns = read_metrics(Path(folder) / "metrics.jsonl")
         label, error = Path(folder).name, columns["val_mie_r_deg"]
         smooth = np.convolve(columns["loss"], np.ones(25) / 25, mode="valid")
         left.plot(columns["step"][12 : 12 + len(smooth)], smooth, label=label, lw=1)

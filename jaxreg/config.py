@@ -187,28 +187,47 @@ class Config:
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
     weights: str = ""
-    """Released weights that `evaluate.py` uses when no checkpoint is given."""
+    """Released weights that `jaxreg evaluate` uses when no checkpoint is given."""
+
+
+def available_configs() -> tuple[str, ...]:
+    """Names of the configurations that come with jaxreg, which `load_config` takes for their files."""
+    return tuple(sorted(path.stem for path in _shipped().glob("*.toml")))
 
 
 def load_config(path: str | Path) -> Config:
     """The configuration of a TOML file of deviations from the defaults.
 
+    `path` may also be one of `available_configs`, with or without ``.toml``; a file of that name in
+    the working directory goes first.
+
     Raises:
-      ValueError: the file is missing or not TOML, or it names an unknown section or field (the
-        nearest known name is given), or a value has the wrong type.
+      ValueError: the file is missing (the names are given) or not TOML, or it names an unknown
+        section or field (the nearest known name is given), or a value has the wrong type.
     """
     path = Path(path)
+    if not path.exists() and path.name == str(path):
+        shipped = _shipped() / f"{path.name.removesuffix('.toml')}.toml"
+        path = shipped if shipped.exists() else path
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ValueError(
-            f"no configuration file at {path}: see configs/ for the ones given."
+            f"no configuration file at {path}: give the path of a file, or one of the names that come "
+            f"with jaxreg ({', '.join(available_configs())})."
         ) from None
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not valid TOML: {error}.") from None
     return from_dict(content, where=str(path))
+
+
+def _shipped() -> Path:
+    """The folder of the configurations: in the installed package, or beside it in a checkout."""
+    package = Path(__file__).parent
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
 
 
 def from_dict(content: dict[str, Any], *, where: str = "configuration") -> Config:

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._extras import extra
 from jaxreg._xla import jit
 from jaxreg.config import Config, TrainConfig
 from jaxreg.data import load_shapes, training_label
@@ -26,6 +26,7 @@ from jaxreg.evaluation.methods import network_method
 from jaxreg.evaluation.metrics import evaluate_transforms
 from jaxreg.evaluation.run import evaluate_method
 from jaxreg.geometry import rigid
+from jaxreg.io.log import read_metrics
 from jaxreg.network.features import BATCH_AXIS
 from jaxreg.network.losses import pose_error, step_losses, total_loss
 from jaxreg.network.model import Variables, init_variables, iterate
@@ -33,6 +34,9 @@ from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
 from jaxreg.weights import checkpoint
 from jaxreg.weights.released import check_new_name, save_weights
+
+with extra("train", "training"):
+    import optax
 
 _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
 
@@ -240,20 +244,27 @@ def _check_options(config: TrainConfig) -> None:
 
 
 def release(
-    name: str, workdir: str | Path, command: str, *, root: str | Path | None = None
-) -> None:
-    """Write the best weights of a run into the package, with a card of how they were made.
+    name: str,
+    workdir: str | Path,
+    command: str,
+    *,
+    directory: str | Path = "",
+    root: str | Path | None = None,
+) -> Path:
+    """Write the best weights of a run into `directory` (the workdir), with a card of their making.
 
     The data is called by what is found in `root`, so that a stand-in is not taken for the original.
+    Returns the path of the card.
 
     Raises:
       ValueError: `name` is not a plain one or is taken, `workdir` holds no checkpoint, or its log
         lacks the step of the best one.
     """
-    check_new_name(name)
+    directory = directory or workdir
+    check_new_name(name, directory)
     variables, config, step = checkpoint.load_best(workdir)
     log = Path(workdir) / "metrics.jsonl"
-    metrics = checkpoint.read_metrics(log)
+    metrics = read_metrics(log)
     rows = np.flatnonzero(metrics["step"] == step)
     if len(rows) == 0:
         # A run that is killed between the two has saved the step and not logged it.
@@ -272,4 +283,4 @@ def release(
             if key.startswith("val_")
         },
     }
-    save_weights(Path(__file__).parent / "weights", name, variables, config, card)
+    return save_weights(directory, name, variables, config, card)

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxreg.cli import commands, process
+from jaxreg.cli import main, process
 from jaxreg.config import load_config
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -54,7 +54,7 @@ def run_shell(code: str) -> str | None:
             if line == "echo $?":
                 print(status)
             else:
-                status = commands.main(shlex.split(line)[1:])
+                status = main(shlex.split(line)[1:])
     return printed.getvalue()
 
 

@@ -1,27 +1,24 @@
 """Training: unsupervised, resumable bit for bit, and stopped by a loss that is not finite."""
 
 import dataclasses
-import errno
 import functools
 import json
 import re
-import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import train as script
 from jaxreg import training
 from jaxreg.config import Config, DataConfig, TrainConfig, from_dict
 from jaxreg.data import training_label
 from jaxreg.types import RigidTransform
 from jaxreg.weights import checkpoint
+from jaxreg.weights.released import load_pretrained
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
 
@@ -326,15 +323,7 @@ def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
     assert re.search(r"ValueError: .*best cannot be read \(.*\): put a whole copy", done.stderr)
 
 
-@pytest.fixture
-def released(monkeypatch) -> list:
-    """What `release` would write into the package."""
-    written = []
-    monkeypatch.setattr(training, "save_weights", lambda *arguments: written.append(arguments))
-    return written
-
-
-def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path, released):
+def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path):
     data = dataclasses.replace(config.data, label="what is tested on")
     config = dataclasses.replace(config, data=data)
     state = training.create_train_state(config)
@@ -343,12 +332,15 @@ def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path, r
             run.save(step, state._replace(step=jnp.int32(step)), error)
             run.log({"step": step - 1, "loss": 0.5})
             run.log({"step": step, "loss": 0.5, "val_mie_r_deg": error, "val_mae_t": 1.0})
-    training.release("mine", tmp_path, "python train.py 'a b'")
-    ((_, name, variables, saved, card),) = released
-    assert (name, saved) == ("mine", config)
+    path = training.release("mine", tmp_path, "jaxreg train 'a b'")
+    assert path == tmp_path / "mine.json", "beside the run, and not in the package"
+    variables, saved = load_pretrained(str(tmp_path / "mine"))
     jax.tree.map(np.testing.assert_array_equal, variables, state.average)
+    assert saved == config
+    card = json.loads(path.read_text("utf-8"))
+    del card["config"]
     assert card == {
-        "command": "python train.py 'a b'",
+        "command": "jaxreg train 'a b'",
         "data": "shapes",
         "seed": 0,
         "step": 2,
@@ -356,16 +348,16 @@ def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path, r
     }
 
 
-def test_a_log_without_the_best_step_is_an_error_that_says_so(config, tmp_path, released):
+def test_a_log_without_the_best_step_is_an_error_that_says_so(config, tmp_path):
     state = training.create_train_state(config)._replace(step=jnp.int32(2))
-    with checkpoint.open_run(tmp_path, config) as run:
+    with checkpoint.open_run(tmp_path / "run", config) as run:
         run.save(2, state, error=1.0)
         run.log({"step": 1, "loss": 0.5})
     with pytest.raises(ValueError, match=r"metrics.jsonl lacks step 2.* finish"):
-        training.release("mine", tmp_path, "")
+        training.release("mine", tmp_path / "run", "", directory=tmp_path / "weights")
     with pytest.raises(ValueError, match="there are weights 'modelnet40' already"):
-        training.release("modelnet40", tmp_path, "")
-    assert not released
+        training.release("modelnet40", tmp_path / "run", "", directory=tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
 
 
 def test_the_data_of_a_card_is_what_was_trained_on(tmp_path):
@@ -380,69 +372,3 @@ def test_the_data_of_a_card_is_what_was_trained_on(tmp_path):
     }
     for name, data in called.items():
         assert training_label(data, tmp_path) == name
-
-
-@pytest.fixture
-def run_script(tmp_path, monkeypatch, capsys):
-    """Runs train.py in this process; returns its status and its messages. Training is replaced."""
-    toml = tmp_path / "c.toml"
-    toml.write_text('[data]\nname = "shapes"\n')
-
-    def run(*arguments, train=lambda config, workdir, *, root: None):
-        with monkeypatch.context() as patched:
-            patched.setattr(sys, "argv", ["train.py", str(toml), *map(str, arguments)])
-            patched.setattr(script, "enable_compilation_cache", lambda: None)
-            patched.setattr(script, "train", train)
-            try:
-                script.main()
-            except SystemExit as end:
-                return end.code, capsys.readouterr().err
-        return 0, capsys.readouterr().err
-
-    return run
-
-
-def one_step(config, workdir, *, root):
-    Path(workdir).mkdir(exist_ok=True)
-    (Path(workdir) / "metrics.jsonl").write_text('{"step": 1, "loss": 1.0}\n')
-
-
-def test_a_card_gets_the_command_as_it_was_typed(run_script, tmp_path, monkeypatch):
-    released = []
-    monkeypatch.setattr(
-        script, "release", lambda name, workdir, command, *, root: released.append((name, command))
-    )
-    typed = ["--workdir", str(tmp_path / "a run"), "--train.steps", "7", "--release", "mine"]
-    assert run_script(*typed, train=one_step) == (0, "")
-    ((name, command),) = released
-    assert name == "mine"
-    assert shlex.split(command) == ["python", "train.py", str(tmp_path / "c.toml"), *typed]
-
-
-def test_weights_are_not_replaced_and_that_is_said_before_the_training(run_script):
-    status, message = run_script("--release", "modelnet40", train=None)
-    assert status == 2
-    assert message.startswith("error: there are weights 'modelnet40' already")
-
-
-def test_after_the_training_an_error_is_one_line_and_loses_nothing(run_script, tmp_path):
-    (tmp_path / "curves.png").mkdir()
-    status, message = run_script("--workdir", tmp_path, train=one_step)
-    assert status == 2
-    assert message.startswith(f"error: {tmp_path}/curves.png: Is a directory")
-    assert f"({tmp_path} holds the whole run: the same command does the rest)" in message
-    assert len(message.splitlines()) == 1
-
-
-def test_an_error_of_the_file_system_is_one_line_and_status_2(run_script):
-    def full(config, workdir, *, root):
-        raise OSError(errno.ENOSPC, "No space left on device", "runs/c/latest")
-
-    expected = "error: runs/c/latest: No space left on device\n"
-    assert run_script(train=full) == (2, expected)
-
-
-def test_a_workdir_that_is_a_file_is_one_line_and_status_2(run_script, tmp_path):
-    status, message = run_script("--workdir", tmp_path / "c.toml", train=training.train)
-    assert (status, len(message.splitlines())) == (2, 1)
-    assert message.startswith(f"error: {tmp_path}/c.toml is a file")

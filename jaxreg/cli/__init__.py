@@ -1,5 +1,55 @@
-"""The command `jaxreg`."""
+"""The command `jaxreg`: five programs, of which only the one that is called for is loaded.
 
-from jaxreg.cli.commands import main
+Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted, 130 interrupted.
+"""
+
+import gc
+import importlib
+import sys
+
+import tyro
+
+from jaxreg import __version__
+from jaxreg.cli import process
+from jaxreg.cli.info import Info
+from jaxreg.cli.options import SUCCESS, say, status_of
+from jaxreg.cli.register import Register
+from jaxreg.cli.view import View
 
 __all__ = ["main"]
+
+
+class Train:
+    """Train a network on pairs that a configuration describes: jaxreg train CONFIG.toml ..."""
+
+
+class Evaluate:
+    """Evaluate a network or another method on such pairs: jaxreg evaluate CONFIG.toml ..."""
+
+
+_WITH_CONFIGURATION = ("train", "evaluate")
+"""Their options depend on the file that follows, so that they parse their own command lines."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The console script `jaxreg`; returns the exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given == ["--version"]:
+        say(f"jaxreg {__version__}")
+        return SUCCESS
+    if given[:1] == ["train"] and arguments is None:
+        process.restart_with_huge_pages()
+    if given and given[0] in _WITH_CONFIGURATION:
+        return importlib.import_module(f"jaxreg.cli.{given[0]}").main(given[1:])
+    command = tyro.extras.subcommand_cli_from_dict(
+        {"register": Register, "info": Info, "view": View, "train": Train, "evaluate": Evaluate},
+        prog="jaxreg",
+        description="Rigid registration of point clouds (jaxreg --version tells which).",
+        args=given,
+    )
+    # Tracing makes a million small objects and no garbage worth a search: a tenth of a short run.
+    gc.disable()
+    try:
+        return status_of(command.run)
+    finally:
+        gc.enable()

@@ -1,16 +1,25 @@
-"""The command line of the scripts: a configuration file first, then deviations from it."""
+"""What the commands share: configurations as arguments, exit statuses, and words on a terminal."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import tyro
+from rich.console import Console
 
 from jaxreg.config import Config, load_config
 
+SUCCESS, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 2, 3, 130
+
 
 def parse(
-    options: type, *, description: str, arguments: list[str] | None = None
+    options: type,
+    *,
+    description: str | None,
+    arguments: list[str] | None = None,
+    program: str = "",
 ) -> tuple[Path, Any]:
     """``CONFIG.toml [--option value ...] [--section.field value ...]`` as (path, `options`).
 
@@ -27,17 +36,26 @@ def parse(
             config = load_config(path)
         except ValueError as error:
             stop(str(error))
-    program = f"{Path(sys.argv[0]).name} CONFIG.toml"
     parsed = tyro.cli(
-        options, default=options(config=config), args=rest, prog=program, description=description
+        options,
+        default=options(config=config),
+        args=rest,
+        prog=f"{program or Path(sys.argv[0]).name} CONFIG.toml",
+        description=description,
     )
     return path, parsed
 
 
-def stop(message: str, *, status: int = 2) -> NoReturn:
-    """End the program with one message: status 2 for bad input, as `jaxreg` does."""
-    print(f"error: {message}" if status == 2 else message, file=sys.stderr)  # noqa: T201
-    raise SystemExit(status)
+def status_of(run: Callable[[], int], *, interrupted: str = "interrupted") -> int:
+    """The exit status of a command, whose mistakes are told in one line and not by a traceback."""
+    try:
+        return run()
+    except KeyboardInterrupt:
+        complain(interrupted)
+        return INTERRUPTED
+    except (ValueError, OSError, FloatingPointError, ImportError) as error:
+        complain(f"error: {told(error)}")
+        return BAD_INPUT
 
 
 def told(error: Exception) -> str:
@@ -45,3 +63,37 @@ def told(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return str(error)
+
+
+def stop(message: str, *, status: int = BAD_INPUT) -> NoReturn:
+    """End the program with one message: status 2 for bad input."""
+    complain(f"error: {message}" if status == BAD_INPUT else message)
+    raise SystemExit(status)
+
+
+def complain(message: str) -> None:
+    """One message on standard error, as it is."""
+    console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+    console.print(message, markup=False)
+
+
+def say(text: str) -> None:
+    """A line of the output, as it is: never wrapped, coloured or read as markup."""
+    Console(highlight=False, soft_wrap=True, emoji=False).print(text, markup=False)
+
+
+def line(name: str, value: str) -> None:
+    """A line with a name in front."""
+    say(f"{name:<16} {value}")
+
+
+def finite(points: np.ndarray, path: Path) -> np.ndarray:
+    """The finite points of the file `path`.
+
+    Raises:
+      ValueError: there are none.
+    """
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        raise ValueError(f"{path}: no point is finite: export the file again.")
+    return points

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
+
+from jaxreg._extras import extra
 
 
 def read(path: Path, key: str) -> np.ndarray:
@@ -12,6 +13,8 @@ def read(path: Path, key: str) -> np.ndarray:
     Raises:
       ValueError: the file is missing, not HDF5 or truncated, or holds no array under `key`.
     """
+    with extra("train", f"{path}: HDF5"):
+        import h5py
     if not path.is_file():
         raise ValueError(f"{path} is missing: download the data set again, or correct the list.")
     try:

@@ -1,14 +1,26 @@
 """Clouds from and to files: one function each way, the format chosen by the suffix."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxreg.io import arrays, las, mesh, pcd, ply, text
+from jaxreg.io.matrix import read_matrix
+from jaxreg.io.places import check_folder, check_place, whole
 
-__all__ = ["READABLE", "WRITABLE", "read_cloud", "write_cloud"]
+__all__ = [
+    "READABLE",
+    "WRITABLE",
+    "check_folder",
+    "check_place",
+    "check_writable",
+    "read_cloud",
+    "read_matrix",
+    "whole",
+    "write_cloud",
+]
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".ply": ply.read,
@@ -48,6 +60,7 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
       ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
         truncated, its header names columns without x, y, z, or it holds no point; the message
         names the file, the row where there is one, and the remedy.
+      ImportError: a LAS or LAZ file, and laspy is not installed.
     """
     path = Path(path)
     if path.is_dir():
@@ -74,6 +87,7 @@ def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
 
     Raises:
       ValueError: the suffix is not writable, the folder does not exist, or LAS gets no finite row.
+      ImportError: a LAS or LAZ file, and laspy is not installed.
     """
     path = Path(path)
     check_writable(path)
@@ -81,7 +95,7 @@ def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raises ValueError unless `write_cloud` could write there: suffix, folder, and laspy for LAS."""
+    """Raises what `write_cloud` would that is known before: suffix, folder, and laspy for LAS."""
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(
             f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
@@ -90,18 +104,3 @@ def check_writable(path: Path) -> None:
     if path.suffix.lower() in (".las", ".laz"):
         las.check_installed(path)
     check_folder(path)
-
-
-def check_place(path: Path, taken: Sequence[Path]) -> None:
-    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
-    check_folder(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory: name a file in it.")
-    if path.resolve() in [other.resolve() for other in taken]:
-        raise ValueError(f"{path} is read or written by this command already: choose another name.")
-
-
-def check_folder(path: Path) -> None:
-    """Raises ValueError unless there is a folder for the file."""
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxreg._extras import extra
+
 
 def read(path: Path) -> np.ndarray:
     """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
@@ -27,7 +29,8 @@ def write(path: Path, points: np.ndarray) -> None:
     Rows that are not finite are left out: integers have no NaN. The file then holds fewer points.
 
     Raises:
-      ValueError: laspy is missing, or no row is finite.
+      ImportError: laspy is missing.
+      ValueError: no row is finite.
     """
     laspy = _laspy(path)
     points = points[np.isfinite(points).all(axis=1)]
@@ -59,15 +62,11 @@ def _store(cloud, points: np.ndarray, path: Path) -> None:
 
 
 def check_installed(path: Path) -> None:
-    """Raises ValueError where the file `path` could not be read or written for want of laspy."""
+    """Raises ImportError where the file `path` could not be read or written for want of laspy."""
     _laspy(path)
 
 
 def _laspy(path: Path):
-    try:
+    with extra("las", f"{path}: {path.suffix[1:].upper()}"):
         import laspy
-    except ImportError:
-        raise ValueError(
-            f"{path}: LAS and LAZ need laspy: install it by pip install 'jaxreg[las]'."
-        ) from None
     return laspy

@@ -25,6 +25,8 @@ def read(path: Path) -> np.ndarray:
         content = _GLUED.sub(rb"\1\n", content, count=1)
     elif kind == "stl" and _cut(content):
         raise ValueError(f"{path} is truncated: it announces more triangles: export it again.")
+    elif kind == "obj":
+        content = _utf8(content)
     try:
         shape = trimesh.load(io.BytesIO(content), file_type=kind, process=False)
     except Exception as error:  # noqa: BLE001 - trimesh raises whatever its parsers raise
@@ -41,6 +43,15 @@ def read(path: Path) -> np.ndarray:
     if len(faces) == 0:
         return vertices
     return _sampled(path, vertices, np.asarray(faces))
+
+
+def _utf8(content: bytes) -> bytes:
+    """Text in UTF-8: names in an OBJ file may be in an older encoding, which trimesh would guess."""
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode("latin-1").encode("utf-8")
+    return content
 
 
 def _cut(content: bytes) -> bool:

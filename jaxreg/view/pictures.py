@@ -7,16 +7,19 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
+from jaxreg._extras import extra
 from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.io.log import read_metrics
 from jaxreg.types import RigidTransform
-from jaxreg.weights.checkpoint import read_metrics
+
+with extra("view", "a picture"):
+    from matplotlib import colormaps
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import to_rgb
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 SOURCE, REFERENCE, ALIGNED = "#2a78d0", "#f0a818", "#1f9d55"
 """Blue, yellow and green, as in the paper."""

@@ -13,12 +13,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 from flax.traverse_util import flatten_dict
 
 from jaxreg import config as configuration
+from jaxreg._extras import extra
 from jaxreg.config import Config
 from jaxreg.network.model import Variables, init_variables
+
+with extra("train", "a checkpoint"):
+    import orbax.checkpoint as ocp
 
 
 class Run:
@@ -217,27 +220,6 @@ def _logged_step(line: str) -> float:
 def _difference(saved: Config, wanted: Config) -> str:
     old, new = (flatten_dict(configuration.to_dict(c), sep=".") for c in (saved, wanted))
     return ", ".join(f"{k}: {old[k]!r} there, {new[k]!r} here" for k in new if old[k] != new[k])
-
-
-def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """The columns of a `metrics.jsonl`, NaN where a line has no such entry.
-
-    Raises:
-      ValueError: there is no such file, it is empty, or a line is no JSON object.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no metrics at {path}: give the metrics.jsonl of a training run.")
-    entries = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        try:
-            entries.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
-            raise ValueError(f"{path}, line {number} is no JSON object: remove it.") from None
-    if not entries:
-        raise ValueError(f"{path} is empty: the run has not finished a step yet.")
-    names = dict.fromkeys(name for entry in entries for name in entry)
-    return {name: np.array([entry.get(name, np.nan) for entry in entries], float) for name in names}
 
 
 def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:

@@ -1,80 +1,155 @@
-"""Released weights: plain arrays in `.npz` files, no pickle, each with a card in `.json`.
+"""Weights as files: plain arrays in NAME.npz, and in NAME.json a card that says how they were made.
 
-The card holds the configuration, the data and command of the training, and the validation figures.
+One form for all of them, those of the networks and those of the search's features. NPZ is read without
+pickle and by NumPy alone, written here it holds no time, and a card beside it is read by people and by
+`git diff`. (safetensors would do the same at the price of a compiled dependency, and hide the card in
+its header.) Every card holds the `command` that made the weights, the `data` they were trained on, and
+the `config` they need; that of a network also `seed`, `step`, and the `validation` figures.
+
+Weights that come with the package are called by their name. Those of one's own are called by their path
+without the suffix, or by their name where $JAXREG_WEIGHTS names their directory.
 """
 
 import dataclasses
 import io
 import json
+import os
 import re
 import zipfile
-from importlib import resources
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxreg import config as configuration
 from jaxreg.config import Config
+from jaxreg.io.arrays import read_arrays
+
+_SHIPPED = Path(__file__).parent
+_VARIABLE = "JAXREG_WEIGHTS"
 
 
 def available_weights() -> tuple[str, ...]:
-    """Names that `load_pretrained` knows."""
-    folder = resources.files("jaxreg") / "weights"
-    if not folder.is_dir():
-        return ()
-    names = (item.name for item in folder.iterdir())
-    return tuple(sorted(name.removesuffix(".npz") for name in names if name.endswith(".npz")))
-
-
-def check_new_name(name: str) -> None:
-    """Raises ValueError unless weights can be released as `name`: a plain name that is not taken.
-
-    To replace released weights, delete their two files first.
-    """
-    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise ValueError(f"weights cannot be called {name!r}: use letters, digits, _ and - only.")
-    if name in available_weights():
-        raise ValueError(
-            f"there are weights '{name}' already: choose another name, or delete {name}.npz and "
-            f"{name}.json in {resources.files('jaxreg') / 'weights'} to replace them."
-        )
+    """Names that `load_pretrained` knows: networks of the package and of $JAXREG_WEIGHTS."""
+    names = {card.stem for folder in _folders() for card in folder.glob("*.json")}
+    return tuple(sorted(name for name in names if "model" in load_card(name).get("config", {})))
 
 
 def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:
-    """The variables (numpy arrays) and the configuration of released weights.
+    """The variables (numpy arrays) and the configuration of a network's weights.
+
+    `name` is one of `available_weights`, or the path of such files without their suffix.
 
     Raises:
-      ValueError: there are no weights of that name; the message lists the names.
+      ValueError: there are no such weights (the message lists the names), they are not those of a
+        network, or a file is damaged.
     """
-    if name not in available_weights():
+    arrays, card = load_arrays(name)
+    if "model" not in card["config"]:
         raise ValueError(
-            f"no released weights '{name}': choose from {', '.join(available_weights()) or 'none'}."
+            f"the weights '{name}' are not those of a network: choose from "
+            f"{', '.join(available_weights())}."
         )
-    folder = resources.files("jaxreg") / "weights"
-    with np.load(io.BytesIO((folder / f"{name}.npz").read_bytes()), allow_pickle=False) as arrays:
-        variables = unflatten_dict({key: arrays[key] for key in arrays.files}, sep="/")
-    return variables, configuration.from_dict(load_card(name)["config"], where=f"{name}.json")
+    return _nested(arrays), configuration.from_dict(card["config"], where=f"{name}.json")
+
+
+def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays by their names, as they were saved, and the card.
+
+    Raises:
+      ValueError: there are no such weights (the message lists the names), or a file is damaged.
+    """
+    path = _find(name).with_suffix(".npz")
+    return read_arrays(path, remedy="copy it again, or train again"), load_card(name)
 
 
 def load_card(name: str) -> dict[str, Any]:
-    """How the weights were made: `config`, `command`, `data`, `seed`, `step`, `validation`."""
-    return json.loads((resources.files("jaxreg") / "weights" / f"{name}.json").read_text("utf-8"))
+    """How the weights were made: `command`, `data`, `config`; errors as `load_arrays`."""
+    path = _find(name).with_suffix(".json")
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read ({error}): copy it again.") from None
+    if not isinstance(card, dict) or not isinstance(card.get("config"), dict):
+        raise ValueError(f"{path} is not a card of weights, without `config`: copy it again.")
+    return card
+
+
+def check_new_name(name: str, directory: str | Path) -> None:
+    """Raises ValueError unless weights can be saved as `name` in `directory`: plain and not taken.
+
+    To replace weights, delete their two files first.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise ValueError(f"weights cannot be called {name!r}: use letters, digits, _ and - only.")
+    for folder in (Path(directory), _SHIPPED):
+        if (folder / f"{name}.npz").exists():
+            raise ValueError(
+                f"there are weights '{name}' already: choose another name, or delete {name}.npz and "
+                f"{name}.json in {folder} to replace them."
+            )
 
 
 def save_weights(
-    directory: str | Path, name: str, variables: Any, config: Config, card: dict[str, Any]
-) -> None:
-    """Write `name`.npz and `name`.json in the released form; equal weights give equal bytes."""
+    directory: str | Path, name: str, variables: Any, config: Any, card: Mapping[str, Any]
+) -> Path:
+    """Write `name`.npz and `name`.json; equal weights give equal bytes. Returns the path of the card.
+
+    `variables` is a nested dict of arrays, `config` the dataclass that they need.
+    """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    arrays = {k: np.asarray(v) for k, v in flatten_dict(variables, sep="/").items()}
     with zipfile.ZipFile(directory / f"{name}.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        for key, value in sorted(arrays.items()):
+        for key, value in sorted(_flat(variables)):
             buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, value, allow_pickle=False)
+            np.lib.format.write_array(buffer, np.asarray(value), allow_pickle=False)
             # np.savez stamps the time of writing into the archive.
             archive.writestr(zipfile.ZipInfo(f"{key}.npy"), buffer.getvalue())
-    content = card | {"config": dataclasses.asdict(config)}
-    (directory / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    content = dict(card) | {"config": dataclasses.asdict(config)}
+    path = directory / f"{name}.json"
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return path
+
+
+def _folders() -> list[Path]:
+    """Where a name is looked for, in this order."""
+    own = os.environ.get(_VARIABLE, "").split(os.pathsep)
+    return [_SHIPPED, *(Path(folder) for folder in own if folder)]
+
+
+def _find(name: str) -> Path:
+    """The path of the card of `name`, which may itself be a path without the suffix."""
+    is_path = Path(name).name != name
+    for folder in [Path()] if is_path else _folders():
+        path = folder / f"{name}.json"
+        if path.is_file():
+            return path
+    if is_path:
+        raise ValueError(
+            f"no weights {name}.npz with a card {name}.json: give the path of both without the suffix."
+        )
+    raise ValueError(
+        f"no released weights '{name}': choose from {', '.join(available_weights()) or 'none'}, give "
+        f"the path of your own without the suffix, or set ${_VARIABLE} to their directory."
+    )
+
+
+def _nested(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The tree whose paths are the names; by hand, since Flax takes 0.2 s to import."""
+    tree: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *path, leaf = name.split("/")
+        branch = tree
+        for part in path:
+            branch = branch.setdefault(part, {})
+        branch[leaf] = array
+    return tree
+
+
+def _flat(tree: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, part in tree.items():
+        if isinstance(part, Mapping):
+            yield from _flat(part, f"{above}{name}/")
+        else:
+            yield f"{above}{name}", part

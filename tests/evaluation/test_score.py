@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import evaluate
+from jaxreg.cli import evaluate, process
 from jaxreg.config import Config, ModelConfig, PairConfig, from_dict, load_config
 from jaxreg.evaluation import score
 from jaxreg.weights.checkpoint import open_run
@@ -165,13 +165,13 @@ def toml(tmp_path):
 @pytest.fixture
 def command(toml, monkeypatch, capsys):
     """evaluate.py in this process and in the folder of its files: status, what it prints, its error."""
-    monkeypatch.setattr(evaluate, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(process, "enable_compilation_cache", lambda: None)
     monkeypatch.chdir(toml.parent)
 
     def run(*options):
         status = 0
         try:
-            evaluate.main(["c.toml", *options])
+            status = evaluate.main(["c.toml", *options])
         except SystemExit as end:
             status = end.code
         return status, *capsys.readouterr()

@@ -9,9 +9,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
+from jaxreg.io.log import read_metrics
 from jaxreg.types import RigidTransform
 from jaxreg.view import pictures
-from jaxreg.weights import checkpoint
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_every_curve_of_any_run_is_in_sight(tmp_path, steps):
     pictures.plot_curves(tmp_path / "metrics.jsonl", tmp_path / "curves.png")
     image = imread(tmp_path / "curves.png")
 
-    figure = pictures._curves(checkpoint.read_metrics(tmp_path / "metrics.jsonl"))
+    figure = pictures._curves(read_metrics(tmp_path / "metrics.jsonl"))
     figure.dpi = 150
     figure.draw_without_rendering()
     assert image.shape[1::-1] == tuple(figure.bbox.size)
@@ -106,23 +106,3 @@ def crop(image, box):
     """The part of a picture, first row on top, that a box counted from below encloses."""
     height = len(image)
     return image[round(height - box.y1) : round(height - box.y0), round(box.x0) : round(box.x1)]
-
-
-def test_read_metrics_gives_columns_with_gaps(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"step": 1, "loss": 3}\n{"step": 2, "loss": 2, "val": 0.5}\n')
-    columns = checkpoint.read_metrics(path)
-    np.testing.assert_array_equal(columns["loss"], [3, 2])
-    np.testing.assert_array_equal(columns["val"], [np.nan, 0.5])
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [(None, "no metrics at"), ("", "is empty"), ('{"step": 1}\nrubbish', "line 2 is no JSON")],
-)
-def test_read_metrics_names_what_is_wrong(tmp_path, content, message):
-    path = tmp_path / "metrics.jsonl"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(ValueError, match=message):
-        checkpoint.read_metrics(path)

@@ -1,0 +1,197 @@
+"""Evaluate: `jaxreg evaluate CONFIG.toml [--checkpoint DIR | --method NAME | --transforms FILE]`.
+
+Without any of them the released weights that the configuration (or --weights) names are evaluated.
+Every method meets the same pairs and the same metrics, in float64 from transforms. The pairs are those
+of [data] and [test_pairs]; a network keeps all that it was trained with but its iterations, n_inliers
+and robust_rounds. An option that would change nothing is refused.
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from jaxreg import io
+from jaxreg.cli import process
+from jaxreg.cli.options import SUCCESS, parse, say, status_of
+from jaxreg.config import Config
+from jaxreg.data import root_of
+from jaxreg.evaluation import score
+from jaxreg.evaluation.table import results_table
+
+_METHODS = ("checkpoint", "rienet", "method", "transforms")
+_CHOICE = (*_METHODS, "refine", "pairs", "batch")
+_SUFFIXES = {
+    "json": (),
+    "save_transforms": (".npz",),
+    "save_pairs": (".npz",),
+    "picture": (".png", ".pdf", ".svg"),
+}
+"""The options that name an output, and how its name must end."""
+_TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What evaluate.py takes."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    checkpoint: str = ""
+    """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations and
+    n_inliers of the run unless the command line gives others."""
+    rienet: str = ""
+    """NPZ file with RIENet's released weights (not ours to ship)."""
+    method: str = ""
+    """Another method: register, register_global, register_global_learned, icp, identity, or a baseline
+    such as open3d_fgr (a wrong name lists the baselines)."""
+    transforms: str = ""
+    """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
+    refine: str = ""
+    """Refine the poses of the method on the clouds afterwards: icp, point_to_plane or gicp."""
+    pairs: int = 0
+    """Evaluate the first N pairs only; 0 is all."""
+    batch: int = 8
+    """Pairs registered at once."""
+    json: str = ""
+    """Write the figures to this file."""
+    picture: str = ""
+    """Draw the first pair before and after, as it was evaluated, to this file (PNG, PDF or SVG)."""
+    save_pairs: str = ""
+    """Write the pairs to this NPZ file, for --transforms by another program."""
+    save_transforms: str = ""
+    """Write the predicted transforms to this NPZ file."""
+    data_root: str = ""
+    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse, evaluate, print, write; returns the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    path, options = parse(
+        Options, description=__doc__, arguments=arguments, program="jaxreg evaluate"
+    )
+    return status_of(lambda: _run(options, path, _given(arguments[1:])))
+
+
+def _run(options: Options, path: Path, given: dict[str, str]) -> int:
+    process.enable_compilation_cache()
+    _check(options, path)
+    config = _evaluated_config(options, path, given)
+    root = root_of(config.data, options.data_root, path)
+    chosen = {name: getattr(options, name) for name in _CHOICE}
+    scored = score.evaluate(config, root=root, **chosen)
+    # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
+    try:
+        _report(options, path, scored)
+    finally:
+        _write(options, config, root, scored)
+    return SUCCESS
+
+
+def _check(options: Options, path: Path) -> None:
+    """What cannot be done is said before the work, not after it."""
+    if options.pairs < 0 or options.batch < 1:
+        raise ValueError(
+            f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
+            "--batch 1 or more."
+        )
+    taken = [path, *(Path(p) for p in (options.transforms, options.rienet) if p)]
+    for name, suffixes in _SUFFIXES.items():
+        if getattr(options, name):
+            output = Path(getattr(options, name))
+            if suffixes and output.suffix.lower() not in suffixes:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} {output}: name a file that ends in "
+                    f"{' or '.join(suffixes)}."
+                )
+            io.check_place(output, taken)
+            taken.append(output)
+
+
+def _given(arguments: list[str]) -> dict[str, str]:
+    """The options of a command line, by the field that they set (`model.n_inliers`)."""
+    options = [word.partition("=")[0] for word in arguments if word.startswith("--")]
+    return {option[2:].replace("-", "_"): option for option in options}
+
+
+def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Config:
+    """The configuration to evaluate with, after a word on what differs from the file at `path`.
+
+    What the file says of a network is what train.py starts from; a run may have been made with other
+    options, and its network is evaluated as it was trained. Released weights follow the file, and so
+    do robust rounds, which belong to the pairs and not to the training.
+
+    Raises:
+      ValueError: an option of the command line changes nothing; says what to give instead.
+    """
+    for name, option in given.items():
+        if reason := _no_effect(name, option, options):
+            raise ValueError(f"{option} changes nothing here: {reason}.")
+    config = options.config
+    if not options.checkpoint:
+        return config
+    model = dataclasses.asdict(score.trained_config(config, checkpoint=options.checkpoint).model)
+    changed = {}
+    for name in ("iterations", "n_inliers"):
+        value = getattr(config.model, name)
+        if f"model.{name}" not in given and model[name] != value:
+            changed[name] = model[name]
+            say(
+                f"model.{name} = {model[name]} as {options.checkpoint} was trained, not {value} as "
+                f"in {path} (to have that: --model.{name.replace('_', '-')} {value})"
+            )
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **changed))
+
+
+def _no_effect(name: str, option: str, options: Options) -> str:
+    """Why an option has no effect on an evaluation, and what to do; empty if it has one."""
+    config, (section, _, field) = options.config, name.partition(".")
+    chosen = next((f"--{method}" for method in _METHODS if getattr(options, method)), "")
+    if name == "weights" and chosen:
+        return f"{chosen} says what is evaluated; leave out one of the two"
+    if not field:
+        return ""
+    if section == "pairs":
+        value = getattr(config.pairs, field, True)
+        text = "" if isinstance(value, bool) else f" {value}"  # A switch has no value.
+        return f"[pairs] are to train on; to test on such pairs give --test-{option[2:]}{text}"
+    if section in ("loss", "train") or (section == "data" and field in _TRAINING_DATA):
+        return "it belongs to the training; give it to train.py, or leave it out"
+    if section != "model":
+        return ""
+    if chosen in ("--method", "--transforms"):
+        return f"{chosen} evaluates no network; leave it out"
+    if field in score.AFTER_TRAINING or not (chosen or config.weights):
+        return ""
+    field = field.removeprefix("no_")
+    trained = score.trained_config(config, checkpoint=options.checkpoint, rienet=options.rienet)
+    value = getattr(trained.model, field)
+    if value == getattr(config.model, field):
+        return ""
+    return (
+        f"the weights were trained with {field} = {value}; leave it out, or give it to train.py and "
+        "evaluate that run by --checkpoint"
+    )
+
+
+def _report(options: Options, path: Path, scored: score.Scored) -> None:
+    result = score.figures(scored) | {"config": path.stem}
+    Console().print(results_table([result], title=str(path)))
+    if options.json:
+        Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+def _write(options: Options, config: Config, root: Path | None, scored: score.Scored) -> None:
+    if options.save_transforms:
+        score.save_transforms(options.save_transforms, scored.predicted)
+    if options.save_pairs:
+        _, batches = score.pair_stream(config, root=root, pairs=options.pairs)
+        score.save_pairs(options.save_pairs, batches)
+    if options.picture:
+        from jaxreg.view import pictures
+
+        pictures.draw_first_pair(options.picture, scored)

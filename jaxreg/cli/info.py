@@ -1,0 +1,37 @@
+"""`jaxreg info`: what is in the file of a cloud."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from jaxreg.cli.options import SUCCESS, finite, line
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Describe a cloud: number of points, extent, spacing, defects."""
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
+
+    def run(self) -> int:
+        """Print a line for each property; returns the exit status."""
+        from jaxreg import io
+        from jaxreg.scans import prepare
+
+        points = io.read_cloud(self.file)
+        broken = ~np.isfinite(points).all(axis=1)
+        line("file", f"{self.file}")
+        line("points", f"{len(points):,}")
+        if broken.any():
+            line("not finite", f"{broken.sum():,} points, the first is point {np.argmax(broken)}")
+        points = finite(points, self.file)
+        for axis, a, b in zip("xyz", points.min(axis=0), points.max(axis=0), strict=True):
+            line(axis, f"{a:.9g} to {b:.9g} (extent {b - a:.4g})")
+        distinct = np.unique(points, axis=0)
+        line("repeated", f"{len(points) - len(distinct):,} points")
+        line("spacing", f"{prepare.spacing(distinct - distinct.mean(axis=0)):.4g}")
+        return SUCCESS

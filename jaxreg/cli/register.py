@@ -1,0 +1,238 @@
+"""`jaxreg register`: lay one scan on another, and say how far the result can be trusted."""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from jaxreg.cli import process
+from jaxreg.cli.options import NOT_TRUSTED, SUCCESS, complain, line, say
+from jaxreg.scans.config import RegisterConfig
+
+if TYPE_CHECKING:
+    from jaxreg.scans.pair import ScanRegistration
+
+_CACHE_MISS = "/jax/compilation_cache/cache_misses"
+_COMPILING = (
+    "compiling for clouds of these sizes, about 10 s; the programs are kept in\n"
+    "{directory}, so that later runs need not."
+)
+_HINT = "look at it with --html PAGE.html"
+_START = "; a rough pose to start from helps: --initial T.txt"
+
+
+def _path(**options):
+    """An optional path; its default is not worth a word of the help."""
+    return tyro.conf.arg(metavar="PATH", help_behavior_hint="", **options)
+
+
+OptionalPath = Annotated[Path | None, _path()]
+Output = Annotated[Path | None, _path(aliases=["-o"])]
+Degrees = Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Register:
+    """Lay one scan on another, say how far the result can be trusted, and write what is asked for.
+
+    Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted.
+    """
+
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
+    """Cloud that moves: PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
+    """Cloud that stays."""
+    output: Output = None
+    """Write the aligned source here (PLY and LAS keep colours and whatever else they hold)."""
+    json: OptionalPath = None
+    """Write transform, figures and verdict here (JSON)."""
+    plot: OptionalPath = None
+    """Draw before and after from two sides here (PNG, PDF or SVG)."""
+    html: OptionalPath = None
+    """Write a page with both clouds to turn here; it needs no network."""
+    initial: OptionalPath = None
+    """Start from this 4x4 matrix (text, NPY, or the JSON of an earlier run)."""
+    max_rotation_deg: Degrees = None
+    """How far the clouds may be turned from each other (any angle if left out); settles symmetric
+    things."""
+    refine: Literal["gicp", "icp", "point_to_plane", "none"] = "gicp"
+    """Refinement of the pose that the search finds."""
+    nonfinite: Literal["raise", "drop"] = "raise"
+    """What to do with points that are NaN or infinite."""
+    config: RegisterConfig = RegisterConfig()
+    """Settings that the data usually choose well."""
+
+    def run(self) -> int:
+        """Register, write, print; returns the exit status."""
+        from jaxreg import io
+
+        _check_outputs(self)
+        initial = io.read_matrix(self.initial) if self.initial else None
+        source, reference = (
+            _checked(path, self.nonfinite) for path in (self.source, self.reference)
+        )
+        begin = time.perf_counter()
+        with _patience():
+            result = _registered(self, source, reference, initial)
+        seconds = time.perf_counter() - begin
+        try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
+            _write_results(self, source, reference, result)
+        finally:
+            _print_result(self, (len(source), len(reference)), result, seconds)
+        for path in _outputs(self):
+            line("wrote", str(path))
+        if not result.success:
+            line("hint", _HINT if self.initial else _HINT + _START)
+        return SUCCESS if result.success else NOT_TRUSTED
+
+
+def _registered(
+    command: Register, source: np.ndarray, reference: np.ndarray, initial: np.ndarray | None
+) -> "ScanRegistration":
+    from jaxreg.scans.pair import register
+
+    limit = command.max_rotation_deg
+    config = command.config
+    if limit is not None:
+        config = dataclasses.replace(config, limited_deg=limit)
+    return register(
+        source,
+        reference,
+        initial=initial,
+        rotation="full" if limit is None else "limited",
+        refine=None if command.refine == "none" else command.refine,
+        nonfinite=command.nonfinite,
+        config=config,
+    )
+
+
+def _print_result(
+    command: Register, sizes: tuple[int, int], result: "ScanRegistration", seconds: float
+) -> None:
+    from jaxreg.scans import summary
+
+    for name, size in zip(("source", "reference"), sizes, strict=True):
+        line(name, f"{getattr(command, name)} ({size:,} points)")
+    for name, value in (summary.figures(result) | {"time": f"{seconds:.2f} s"}).items():
+        line(name, value.replace("\n", "; "))
+    say("transformation (source to reference)")
+    say(summary.matrix_text(result.transformation))
+    line("verdict", summary.verdict_line(result))
+    if reason := getattr(result, "reason", ""):
+        line("reason", reason)
+
+
+def _outputs(command: Register) -> list[Path]:
+    return [p for p in (command.output, command.json, command.plot, command.html) if p]
+
+
+def _check_outputs(command: Register) -> None:
+    """What cannot be written is said before the work, not after it."""
+    from jaxreg import io
+
+    if command.output:
+        io.check_writable(command.output)
+    if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
+    if command.plot:
+        importlib.import_module("jaxreg.view.pictures")  # which needs matplotlib
+    taken = [command.source, command.reference, *filter(None, [command.initial])]
+    for path in _outputs(command):
+        io.check_place(path, taken)
+        taken.append(path)
+
+
+def _checked(path: Path, nonfinite: str) -> np.ndarray:
+    """The points of a file that `register` will accept."""
+    from jaxreg import io
+    from jaxreg.geometry import clouds
+
+    points = io.read_cloud(path)
+    finite = np.isfinite(points).all(axis=1)
+    if nonfinite == "raise" and not finite.all():
+        row = int(np.argmin(finite))
+        raise ValueError(
+            f"{path}: {np.sum(~finite):,} of {len(points):,} points are not finite, the first is "
+            f"point {row}: remove them, or give --nonfinite drop."
+        )
+    clouds.check_points(points, str(path), nonfinite="drop")
+    return points
+
+
+def _write_results(
+    command: Register, source: np.ndarray, reference: np.ndarray, result: "ScanRegistration"
+) -> None:
+    from jaxreg import io
+    from jaxreg.view import page
+
+    def write_page(path: Path) -> None:
+        names = (command.source.name, command.reference.name)
+        page.write_registration_page(path, source, reference, result, names=names)
+
+    def draw(path: Path) -> None:
+        page.draw_registration(path, source, reference, result)
+
+    writers: tuple[tuple[Path | None, Callable[[Path], None]], ...] = (
+        (command.output, lambda path: _write_moved(path, command.source, source, result)),
+        (command.json, lambda path: _write_json(path, command, result)),
+        (command.plot, draw),
+        (command.html, write_page),
+    )
+    for path, write in writers:
+        if path is not None:
+            with io.whole(path) as part:
+                write(part)
+
+
+def _write_moved(
+    path: Path, original: Path, source: np.ndarray, result: "ScanRegistration"
+) -> None:
+    """The aligned source; between two files of one rich format all that the original holds."""
+    from jaxreg import io
+
+    kinds = {original.suffix.lower(), path.suffix.lower()}
+    if kinds == {".ply"}:
+        io.ply.write_moved(path, original, result.rotation, result.translation)
+    elif kinds <= {".las", ".laz"}:
+        io.las.write_moved(path, original, result.rotation, result.translation)
+    else:
+        io.write_cloud(path, source @ result.rotation.T + result.translation)
+
+
+def _write_json(path: Path, command: Register, result: "ScanRegistration") -> None:
+    from jaxreg.scans import summary
+
+    files = {"source": str(command.source), "reference": str(command.reference)}
+    content = json.dumps(files | summary.record(result), indent=1, allow_nan=False)
+    path.write_text(content + "\n", "utf-8")
+
+
+@contextlib.contextmanager
+def _patience() -> Iterator[None]:
+    """A spinner on a terminal; and once, where a program is not on disk yet, a word about that."""
+    import jax
+    from jax import monitoring
+
+    process.enable_compilation_cache(least_seconds=0.0)
+    directory, said = jax.config.jax_compilation_cache_dir, False
+
+    def listen(event: str, **_) -> None:
+        nonlocal said
+        if event == _CACHE_MISS and not said:
+            said = True
+            complain(_COMPILING.format(directory=directory))
+
+    monitoring.register_event_listener(listen)
+    try:
+        with Console(stderr=True, highlight=False).status("registering"):
+            yield
+    finally:
+        monitoring.unregister_event_listener(listen)

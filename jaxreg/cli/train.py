@@ -1,0 +1,79 @@
+"""Train a network: `jaxreg train CONFIG.toml --workdir DIR [--section.field value ...]`.
+
+CONFIG.toml is a file of yours or the name of one that comes with jaxreg (a wrong name lists them).
+Run again with the same workdir to resume. Writes metrics.jsonl, curves.png, the newest and the best
+checkpoint by validation error.
+"""
+
+import dataclasses
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxreg.cli import process
+from jaxreg.cli.options import SUCCESS, parse, say, status_of, told
+from jaxreg.config import Config
+from jaxreg.data import root_of
+from jaxreg.training import release, train
+from jaxreg.weights.released import check_new_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What `jaxreg train` takes."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    workdir: str = ""
+    """Directory of the run (runs/CONFIG if left out); one that holds a run is resumed."""
+    release: str = ""
+    """Write the best weights under this new name, with a card of how they were made."""
+    release_to: str = ""
+    """Directory to write them to (the workdir if left out); `jaxreg.load_pretrained` takes
+    DIRECTORY/NAME, or NAME where $JAXREG_WEIGHTS names the directory."""
+    data_root: str = ""
+    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse, train, say where the results are; returns the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    path, options = parse(Options, description=__doc__, arguments=arguments, program="jaxreg train")
+    command = shlex.join(["jaxreg", "train", *arguments])
+    return status_of(
+        lambda: _run(options, path, command),
+        interrupted="interrupted: the same command goes on from the last validation",
+    )
+
+
+def _run(options: Options, path: Path, command: str) -> int:
+    workdir = options.workdir or f"runs/{path.stem}"
+    place = options.release_to or workdir
+    process.enable_compilation_cache()
+    if options.release:
+        check_new_name(options.release, place)
+    root = root_of(options.config.data, options.data_root, path)
+    train(options.config, workdir, root=root)
+    try:
+        drawn = _draw_curves(workdir)
+        if options.release:
+            card = release(options.release, workdir, command, root=root, directory=place)
+            say(f"weights and card: {card.with_suffix('')}")
+    except (ValueError, OSError) as error:
+        rest = f"({workdir} holds the whole run: the same command does the rest)"
+        raise ValueError(f"{told(error)} {rest}") from error
+    say(f"best checkpoint, metrics.jsonl{drawn}: {workdir}")
+    return SUCCESS
+
+
+def _draw_curves(workdir: str) -> str:
+    """Draw curves.png where there is matplotlib, which training can do without."""
+    try:
+        from jaxreg.view.pictures import plot_curves
+    except ImportError as error:
+        say(f"{workdir}/curves.png is not drawn: {error}")
+        return ""
+    plot_curves(f"{workdir}/metrics.jsonl", f"{workdir}/curves.png")
+    return " and curves.png"

@@ -1,0 +1,44 @@
+"""Where files are written: said before the work if it cannot be, and whole or as it was before."""
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+
+def check_place(path: Path, taken: Sequence[Path] = ()) -> None:
+    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
+    check_folder(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory: name a file in it.")
+    if path.resolve() in [other.resolve() for other in taken]:
+        raise ValueError(f"{path} is read or written by this command already: choose another name.")
+
+
+def check_folder(path: Path) -> None:
+    """Raises ValueError unless there is a folder for the file."""
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A file to write to, which takes the place of `path` once it is complete.
+
+    Raises:
+      ValueError: it cannot be written there.
+    """
+    if path.exists() and not path.is_file():  # A device or a pipe is written as it is.
+        yield path
+        return
+    part = path.resolve().with_name(f".{os.getpid()}-{path.name}")
+    try:
+        yield part
+        part.replace(path.resolve())
+    except OSError as error:
+        raise ValueError(
+            f"{path} could not be written ({error.strerror or error}): choose another place."
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):  # The folder may be gone, too.
+            part.unlink(missing_ok=True)
