@@ -99,18 +99,16 @@ def _registered(
 ) -> "ScanRegistration":
     from jaxreg.scans.pair import register
 
-    limit = command.max_rotation_deg
-    config = command.config
-    if limit is not None:
-        config = dataclasses.replace(config, limited_deg=limit)
+    refinement = command.config.refine or RefineConfig()
+    method = command.refine
+    refinement = None if method == "none" else dataclasses.replace(refinement, method=method)
     return register(
         source,
         reference,
         initial=initial,
-        rotation="full" if limit is None else "limited",
-        refine=None if command.refine == "none" else command.refine,
+        max_rotation_deg=command.max_rotation_deg,
         nonfinite=command.nonfinite,
-        config=config,
+        config=dataclasses.replace(command.config, refine=refinement),
     )
 
 
@@ -126,8 +124,8 @@ def _print_result(
     say("transformation (source to reference)")
     say(summary.matrix_text(result.transformation))
     line("verdict", summary.verdict_line(result))
-    if reason := getattr(result, "reason", ""):
-        line("reason", reason)
+    if result.reason:
+        line("reason", result.reason)
 
 
 def _outputs(command: Register) -> list[Path]:

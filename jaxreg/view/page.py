@@ -100,7 +100,7 @@ def _headline(result: ScanRegistration, source: np.ndarray, *, shortened: bool) 
 
 
 def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
-    template = (resources.files("jaxreg") / "viewer.html").read_text("utf-8")
+    template = (resources.files("jaxreg.view") / "viewer.html").read_text("utf-8")
     # "</script" would end the element that holds the data, "<!--" could swallow its end.
     data = json.dumps(content).replace("<", "\\u003c")
     page = template.replace("{{title}}", html.escape(title)).replace("{{data}}", data)
