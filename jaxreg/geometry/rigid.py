@@ -1,4 +1,11 @@
-"""Rigid transforms: apply, compose, invert, and the way from and to 4x4 matrices."""
+"""Rigid transforms: apply, compose, invert, and the way from and to 4x4 matrices and jaxlie.
+
+A transform may have leading axes, ``rotation (*b, 3, 3)`` and ``translation (*b, 3)``: one
+transform for every index of them.
+"""
+
+import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,37 +21,114 @@ def identity(dtype=None) -> RigidTransform:
 
 
 def apply(transform: RigidTransform, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """``R x + t`` for every point ``x``; the unit is that of `points`."""
-    rotated = jnp.matmul(points, transform.rotation.T, precision=Precision.HIGHEST)
-    return rotated + jnp.broadcast_to(transform.translation, rotated.shape)
+    """``R x + t`` for every point ``x``; the unit is that of `points`.
+
+    One transform moves points of any shape ``(..., 3)``. Many, with leading axes ``b``, move
+    ``(*b, ..., 3)``: each its own points.
+
+    Raises:
+      ValueError: the transform is not one, or the points do not begin with its leading axes.
+    """
+    batch = _leading_axes(transform)
+    if points.ndim < 1 or points.shape[-1] != 3:
+        raise ValueError(f"points must have shape (..., 3), got {points.shape}.")
+    if points.shape[:-1][: len(batch)] != batch:
+        raise ValueError(
+            f"transforms with the leading axes {batch} cannot move points {points.shape}: give "
+            f"points {(*batch, '...', 3)}, or jax.vmap over one of the two."
+        )
+    rows = points.reshape(*batch, math.prod(points.shape[len(batch) : -1]), 3)
+    rotated = jnp.matmul(rows, transform.rotation.mT, precision=Precision.HIGHEST)
+    shift = jnp.broadcast_to(transform.translation[..., None, :], rotated.shape)
+    return (rotated + shift).reshape(points.shape)
 
 
 def compose(second: RigidTransform, first: RigidTransform) -> RigidTransform:
-    """The transform that applies `first`, then `second`: ``(R2 R1, R2 t1 + t2)``."""
+    """The transform that applies `first`, then `second`: ``(R2 R1, R2 t1 + t2)``.
+
+    Leading axes broadcast.
+
+    Raises:
+      ValueError: one of them is not a transform, or their leading axes do not broadcast.
+    """
+    batches = _leading_axes(second), _leading_axes(first)
+    try:
+        batch = np.broadcast_shapes(*batches)
+    except ValueError:
+        raise ValueError(
+            f"transforms with the leading axes {batches[0]} and {batches[1]} do not compose: give "
+            "both the same axes, or one of them none."
+        ) from None
+    second, first = (
+        RigidTransform(
+            jnp.broadcast_to(transform.rotation, (*batch, 3, 3)),
+            jnp.broadcast_to(transform.translation, (*batch, 3)),
+        )
+        for transform in (second, first)
+    )
     rotation = jnp.matmul(second.rotation, first.rotation, precision=Precision.HIGHEST)
     return RigidTransform(rotation, apply(second, first.translation))
 
 
 def inverse(transform: RigidTransform) -> RigidTransform:
-    """The transform from reference back to source: ``(R^T, -R^T t)``."""
-    rotation = transform.rotation.T
-    translation = jnp.matmul(rotation, transform.translation, precision=Precision.HIGHEST)
+    """The transform from reference back to source: ``(R^T, -R^T t)``.
+
+    Raises:
+      ValueError: it is not a transform.
+    """
+    _leading_axes(transform)
+    rotation = transform.rotation.mT
+    column = transform.translation[..., None]
+    translation = jnp.matmul(rotation, column, precision=Precision.HIGHEST)[..., 0]
     return RigidTransform(rotation, -translation)
 
 
-def to_matrix(transform: RigidTransform) -> Float[Array, "4 4"]:
-    """The homogeneous matrix ``[[R, t], [0, 1]]``."""
-    top = jnp.concatenate([transform.rotation, transform.translation[:, None]], axis=1)
-    return jnp.concatenate([top, jnp.eye(4, dtype=top.dtype)[3:]], axis=0)
+def to_matrix(transform: RigidTransform) -> Float[Array, "*b 4 4"]:
+    """The homogeneous matrix ``[[R, t], [0, 1]]``.
+
+    Raises:
+      ValueError: it is not a transform.
+    """
+    batch = _leading_axes(transform)
+    top = jnp.concatenate([transform.rotation, transform.translation[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.eye(4, dtype=top.dtype)[3:], (*batch, 1, 4))
+    return jnp.concatenate([top, last], axis=-2)
 
 
-def from_matrix(matrix: Float[Array, "4 4"]) -> RigidTransform:
-    """The transform of a homogeneous matrix ``[[R, t], [0, 1]]``; the last row is not read."""
-    return RigidTransform(matrix[:3, :3], matrix[:3, 3])
+def from_matrix(matrix: Float[Array, "*b 4 4"]) -> RigidTransform:
+    """The transform of a homogeneous matrix ``[[R, t], [0, 1]]``; the last row is not read.
+
+    Raises:
+      ValueError: it is not ``(..., 4, 4)``.
+    """
+    if matrix.shape[-2:] != (4, 4):
+        raise ValueError(f"a homogeneous matrix has shape (..., 4, 4), not {matrix.shape}.")
+    return RigidTransform(matrix[..., :3, :3], matrix[..., :3, 3])
+
+
+def to_jaxlie(transform: RigidTransform) -> Any:
+    """The same pose as a `jaxlie.SE3`, whose rotation is a unit quaternion.
+
+    Raises:
+      ImportError: jaxlie is not installed.
+      ValueError: it is not a transform.
+    """
+    try:
+        import jaxlie
+    except ImportError:
+        raise ImportError("to_jaxlie needs jaxlie: pip install jaxlie.") from None
+    _leading_axes(transform)
+    rotation = jaxlie.SO3.from_matrix(jnp.asarray(transform.rotation))
+    return jaxlie.SE3.from_rotation_and_translation(rotation, jnp.asarray(transform.translation))
+
+
+def from_jaxlie(pose: Any) -> RigidTransform:
+    """The transform of a `jaxlie.SE3`."""
+    return RigidTransform(pose.rotation().as_matrix(), pose.translation())
 
 
 def rotation_angle_deg(
-    rotation: Float[np.ndarray, "n 3 3"], other: Float[np.ndarray, "n 3 3"]
+    XX
 ) -> Float[np.ndarray, "n"]:
     """Angle between rotations in degrees, ``2 asin(|R1 - R2|_F / (2 sqrt 2))``.
 
@@ -58,3 +142,14 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
     """The rotation nearest to a matrix, orthogonal to float64 (numpy, on the host)."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
     return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def _leading_axes(transform: RigidTransform) -> tuple[int, ...]:
+    """The axes before (3, 3) and (3,), which must be the same."""
+    rotation, translation = transform.rotation.shape, transform.translation.shape
+    if rotation[-2:] != (3, 3) or translation != (*rotation[:-2], 3):
+        raise ValueError(
+            f"a transform has a rotation (..., 3, 3) and a translation (..., 3), not {rotation} "
+            f"and {translation}."
+        )
+    return rotation[:-2]

@@ -27,6 +27,15 @@ def test_signed_zeros_are_one_number():
     assert len(prepare.make_scan([[0.0, 0, 0], [-0.0, 0, 0], [1, 1, 1]], "cloud").points) == 2
 
 
+@pytest.mark.parametrize("kind", ["float32", "float16", "int64", list, np.asfortranarray])
+def test_anything_numeric_will_do(rng, kind):
+    points = np.round(100 * rng.normal(size=(50, 3)))
+    given = points.astype(kind) if isinstance(kind, str) else kind(points)
+    scan = prepare.make_scan(given, "cloud")
+    assert scan.points.dtype == np.float64
+    np.testing.assert_array_equal(scan.points[scan.row], points)
+
+
 def test_frame_and_back(rng):
     source, reference = rng.normal(size=(50, 3)) + 5e6, 3 * rng.normal(size=(70, 3))
     where = frame.common_frame(source, reference)

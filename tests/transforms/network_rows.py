@@ -44,14 +44,14 @@ def network_rows():
     rows = {}
     norm = features.BatchNorm(0.9)
     values = RNG.normal(size=(N, 4))
-    rows["features.BatchNorm"] = (norm, (values, mask), ((np.zeros((N, 4)), mask),))
+    rows["network.features.BatchNorm"] = (norm, (values, mask), ((np.zeros((N, 4)), mask),))
     dgcnn = features.DGCNN((3, 4), 4, 0.9)
-    rows["features.DGCNN"] = (dgcnn, (edges, mask), ((still, mask),))
+    rows["network.features.DGCNN"] = (dgcnn, (edges, mask), ((still, mask),))
     for name in ("InlierNetwork", "PredecessorInlierNetwork"):
         network = getattr(inliers, name)(2, 0.9)
         # Equal structures: the confidence is 1 - tanh|0|, which has no derivative.
         equal = (of_edges[0], of_edges[0], mask)
-        rows[f"inliers.{name}"] = (network, (*of_edges, mask), (equal,))
+        rows[f"network.inliers.{name}"] = (network, (*of_edges, mask), (equal,))
     return {
         name: Row(
             apply_network(network),
