@@ -57,7 +57,9 @@ def _as_floats(points: object, name: str) -> np.ndarray:
     try:
         array = np.asarray(points)
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{name} is not an array ({error}): give an array of shape (n, 3).") from None
+        raise ValueError(
+            f"{name} is not an array ({error}): give an array of shape (n, 3)."
+        ) from None
     if array.dtype.kind not in "fiu":
         raise ValueError(
             f"{name} has dtype {array.dtype}: give real numbers, as in "

@@ -128,8 +128,8 @@ def from_jaxlie(pose: Any) -> RigidTransform:
 
 
 def rotation_angle_deg(
-    XX
-) -> Float[np.ndarray, "n"]:
+    rotation: Float[np.ndarray, "*#n 3 3"], other: Float[np.ndarray, "*#n 3 3"]
+) -> Float[np.ndarray, "*n"]:
     """Angle between rotations in degrees, ``2 asin(|R1 - R2|_F / (2 sqrt 2))``.
 
     Exact to the last digits near 0, where ``arccos((trace - 1) / 2)`` loses half of them.

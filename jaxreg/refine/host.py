@@ -48,7 +48,9 @@ def refine_on_host(
       ValueError: a cloud is not (n, 3), not numeric, holds NaN or infinity, or has fewer than three
         points; or an option is wrong.
     """
-    clouds = [check_points(p, name)[0] for p, name in ((source, "source"), (reference, "reference"))]
+    clouds = [
+        check_points(p, name)[0] for p, name in ((source, "source"), (reference, "reference"))
+    ]
     (source_centre, source_radius), (reference_centre, reference_radius) = map(
         frame.measure, clouds
     )

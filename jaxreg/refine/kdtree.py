@@ -96,7 +96,9 @@ def iterate(
             pairs = tree_pairs(
                 pose, source, reference, stride, both_directions=config.both_directions
             )
-            new = _step(pose, source[2:], reference[2:], pairs, weighting[1:3], widths[i], config=config)
+            new = _step(
+                pose, source[2:], reference[2:], pairs, weighting[1:3], widths[i], config=config
+            )
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
             still = _change(pose, new) < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)

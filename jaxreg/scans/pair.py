@@ -191,7 +191,9 @@ def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig)
     where = frame.Frame(source.centre, reference.centre, length)
     levels = prepare.at_one_density(source, reference)
     sides = zip(levels, (source, reference), strict=True)
-    spacing = max(prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides))
+    spacing = max(
+        prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides)
+    )
     distance = config.inlier_spacings * spacing
     return _Problem(source, reference, where, levels, spacing, distance, config)
 
@@ -227,7 +229,9 @@ def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.
         level.described(unit / cloud.radius, size, config.search)
         for level, cloud in zip(problem.levels, (problem.source, problem.reference), strict=True)
     )
-    unmoved = frame.transform_in(where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3)))
+    unmoved = frame.transform_in(
+        where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3))
+    )
     # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
     also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
     found = _program(config)(*described, also, np.float32(most))

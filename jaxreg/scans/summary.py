@@ -36,7 +36,8 @@ def figures(result: ScanRegistration) -> dict[str, str]:
         "fitness": f"{result.fitness:.2f} within {result.max_correspondence_distance:.4g}",
         "inlier rmse": f"{result.inlier_rmse:.4g}",
         "one sigma": f"{turn:.2g} deg, {shift:.2g}" if known else _UNKNOWN,
-        "weak directions": "\n".join(direction.name for direction in result.weak_directions) or ("none" if known else _UNKNOWN),
+        "weak directions": "\n".join(direction.name for direction in result.weak_directions)
+        or ("none" if known else _UNKNOWN),
         "converged": {True: "yes", False: "no", None: "not refined"}[result.converged],
         "alternatives": _alternatives(result),
         "dropped points": str(result.dropped),

@@ -62,7 +62,11 @@ def evidence(
         agreement(moved[near], fixed[partner], x_normals[near], y_normals[partner]),
         agreement(fixed[other_near], moved[other], y_normals[other_near], x_normals[other]),
     )
-    own = [(scale * across, cosine) for level, scale in (source, reference) for across, cosine in [level.own_agreement]]
+    own = [
+        (scale * across, cosine)
+        for level, scale in (source, reference)
+        for across, cosine in [level.own_agreement]
+    ]
     across, cosine = (np.concatenate(parts) for parts in zip(*sides, strict=True))
     own_across, own_cosine = (np.concatenate(parts) for parts in zip(*own, strict=True))
     return Evidence(
@@ -115,7 +119,9 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...]) -> str:
         f"Only {found.smaller:.0%} of one of the clouds lies near the other.",
         f"The surfaces lie {found.gap:.1f} times as far apart as neighbouring points of one cloud.",
         "The surfaces face different ways where they lie near each other.",
-        "The surfaces hardly resist a motion: " + (", ".join(d.name for d in weak) or "see sigma") + ".",
+        "The surfaces hardly resist a motion: "
+        + (", ".join(d.name for d in weak) or "see sigma")
+        + ".",
         "Another pose agrees about as well (see alternatives).",
     )[int(np.argmin(short))]
 

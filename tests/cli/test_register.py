@@ -164,7 +164,7 @@ MISTAKES = {
     "written as .png, .pdf or .svg": ["good.csv", "good.csv", "--plot", "r.bmp"],
     "holds no 4x4 matrix": ["good.csv", "good.csv", "--initial", "two.xyz"],
     "absent.txt: there is no such file": ["good.csv", "good.csv", "--initial", "absent.txt"],
-    "no rigid transform": ["good.csv", "good.csv", "--initial", "scale.npy"],
+    "not a rigid transform": ["good.csv", "good.csv", "--initial", "scale.npy"],
     "may be transposed": ["good.csv", "good.csv", "--initial", "transposed.npy"],
     "config.search_points must be at least 16": [
         "good.csv",
@@ -172,7 +172,12 @@ MISTAKES = {
         "--config.search-points",
         "0",
     ],
-    "config.reach must be positive": ["good.csv", "good.csv", "--config.reach", "nan"],
+    "config.inlier_spacings must be positive": [
+        "good.csv",
+        "good.csv",
+        "--config.inlier-spacings",
+        "nan",
+    ],
 }
 
 

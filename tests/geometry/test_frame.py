@@ -44,3 +44,40 @@ def test_single_points_have_unit_length():
 def test_wrong_shapes_are_named(shape):
     with pytest.raises(ValueError, match=r"reference must have shape \(n, 3\)"):
         frame.check_clouds(jnp.zeros((5, 3)), jnp.zeros(shape))
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+def test_measures_of_a_cloud_on_the_host(offset, seed):
+    points = np.random.default_rng(seed).normal(size=(50, 3)) * 3.0
+    centre, radius = frame.measure(points + offset)
+    np.testing.assert_allclose(centre, points.mean(axis=0) + offset, rtol=1e-14)
+    expected = np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))
+    assert radius == pytest.approx(expected, rel=1e-8)
+
+
+def test_rounding_of_an_offset_is_no_spread():
+    points = np.full((10, 3), 5e6)
+    points[::2] += 1e-9
+    assert frame.measure(points)[1] == 0
+
+
+def test_host_and_device_agree_on_the_frame(seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(20, 3)), 3 * rng.normal(size=(30, 3)) + 1.0
+    (source_centre, s), (reference_centre, r) = frame.measure(x), frame.measure(y)
+    where = frame.Frame(source_centre, reference_centre, np.sqrt((s**2 + r**2) / 2))
+    device, _, _ = frame.enter(jnp.asarray(x), jnp.asarray(y), None, None)
+    for one, other in zip(where, device, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    turn = Rotation.random(rng=rng).as_matrix()
+    pose = RigidTransform(turn, rng.normal(size=3))
+    inner = frame.transform_in(where, pose)
+    assert inner.translation.dtype == np.float64
+    moved = (x - where.source_centre) / where.length @ inner.rotation.T + inner.translation
+    expected = (x @ turn.T + pose.translation - where.reference_centre) / where.length
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+    np.testing.assert_allclose(
+        frame.transform_out(where, inner).translation, pose.translation, atol=1e-12
+    )
+    on_device = frame.transform_in(device, RigidTransform(*map(jnp.asarray, pose)))
+    np.testing.assert_allclose(on_device.translation, inner.translation, atol=1e-12)

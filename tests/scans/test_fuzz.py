@@ -3,6 +3,7 @@
 240 examples by default; `make fuzz` (the hypothesis profile "fuzz") runs 10,000.
 """
 
+import dataclasses
 import re
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 
 pytestmark = pytest.mark.untyped
@@ -129,19 +131,21 @@ def assert_answers(source, reference, options):
 
 
 # Four tests, so that several processes share the work.
-@pytest.mark.parametrize("refine", ["gicp", "icp", "point_to_plane", None])
+@pytest.mark.parametrize("method", ["gicp", "icp", "point_to_plane", None])
 @settings(max_examples=EXAMPLES // 5)
 @given(
     source=clouds,
     reference=clouds,
     disguise=disguises,
-    rotation=st.sampled_from(["limited", "full"]),
+    largest=st.sampled_from([80.0, None]),
     nonfinite=st.sampled_from(["raise", "drop"]),
 )
 def test_any_input_gives_a_rigid_transform_or_a_remedy(
-    refine, source, reference, disguise, rotation, nonfinite
+    method, source, reference, disguise, largest, nonfinite
 ):
-    options = {"rotation": rotation, "refine": refine, "nonfinite": nonfinite}
+    refine = method and dataclasses.replace(RegisterConfig().refine, method=method)
+    options = {"max_rotation_deg": largest, "nonfinite": nonfinite}
+    options["config"] = RegisterConfig(refine=refine)
     assert_answers(DISGUISES[disguise](source), reference, options)
 
 

@@ -3,12 +3,15 @@
 T01 to T25 are the degenerate cases that every room is tested with.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural import shapes
+from jaxreg.refine.config import RefineConfig
 from jaxreg.scans import verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
@@ -16,6 +19,7 @@ from jaxreg.types import RigidTransform
 from tests.scenes import angle_deg, assert_proper, moved, pose, revolved, shape
 
 STAIRS, TABLE, CHAIR = 8, 9, 10
+UNREFINED = RegisterConfig(refine=None)
 
 
 @pytest.fixture
@@ -72,7 +76,7 @@ def test_record(pair, result):
     aligned = source @ result.rotation.T + result.translation
     distance = np.linalg.norm(aligned[:, None] - reference[None], axis=2)
     np.testing.assert_allclose(result.correspondences, reference[np.argmin(distance, axis=1)])
-    near = distance.min(axis=1) <= result.reach
+    near = distance.min(axis=1) <= result.max_correspondence_distance
     assert result.fitness == pytest.approx(near.mean())
     assert result.inlier_rmse == pytest.approx(np.sqrt(np.mean(distance.min(axis=1)[near] ** 2)))
     assert result.covariance.shape == (6, 6)
@@ -153,7 +157,8 @@ def test_order_changes_no_bit_where_distances_tie(rng):
 def test_same_input_gives_the_same_bits(pair, result):
     """T21."""
     again = register(*pair[:2])
-    for one, other in zip(again, result, strict=True):
+    for field in dataclasses.fields(result):
+        one, other = (getattr(found, field.name) for found in (again, result))
         if isinstance(one, np.ndarray):
             np.testing.assert_array_equal(one, other)
 
@@ -226,7 +231,7 @@ def test_given_pose_skips_the_search(pair):
     shift = truth.translation + truth.rotation @ source.mean(axis=0) - near @ source.mean(axis=0)
     found = register(source, reference, initial=RigidTransform(near, shift))
     assert angle_deg(found.rotation, truth.rotation) < 1
-    kept = register(source, reference, initial=RigidTransform(near, shift), refine=None)
+    kept = register(source, reference, initial=RigidTransform(near, shift), config=UNREFINED)
     np.testing.assert_allclose(kept.rotation, near, atol=1e-14)
     np.testing.assert_allclose(kept.translation, shift, atol=1e-14)
     assert np.isnan(found.evidence.rival)
@@ -238,18 +243,19 @@ def test_a_pose_that_is_not_refined_stays_even_where_points_coincide():
     turn = Rotation.from_rotvec(np.radians(30) * np.array([1, 2, 3]) / 14**0.5).as_matrix()
     start = np.block([[turn, np.zeros((3, 1))], [0, 0, 0, 1]])  # about the middle of the grid
     grid = np.stack(np.meshgrid(*[np.arange(-1.0, 2)] * 3), axis=-1).reshape(-1, 3)
-    kept = register(grid, grid, initial=start, refine=None)
+    kept = register(grid, grid, initial=start, config=UNREFINED)
     np.testing.assert_allclose(kept.transformation, start, atol=1e-14)
 
 
 @pytest.mark.parametrize("method", ["icp", "point_to_plane", None])
 def test_other_refinements(pair, method):
-    found = register(*pair[:2], refine=method)
+    refine = method and dataclasses.replace(RegisterConfig().refine, method=method)
+    found = register(*pair[:2], config=RegisterConfig(refine=refine))
     assert angle_deg(found.rotation, pair[2].rotation) < 3
 
 
 def test_limited_rotation_is_kept(pair):
-    found = register(*pair[:2], rotation="limited")
+    found = register(*pair[:2], max_rotation_deg=80)
     # The right pose turns by 160 degrees; a refinement may turn on, but hardly.
     assert angle_deg(found.rotation, np.eye(3)) < 80.5
     assert found.evidence.rival <= verdict.NO_RIVAL  # and no pose beyond counts as a rival
@@ -261,7 +267,7 @@ def test_limited_rotation_is_kept_where_all_rotations_fit(seed):
     angle, height = rng.uniform(0, 2 * np.pi, (2, 450)), rng.uniform(-0.8, 0.8, (2, 450))
     radius = 0.4 + 0.15 * np.sin(4 * height)
     vases = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
-    found = register(*vases, rotation="limited", config=RegisterConfig(limited_deg=10))
+    found = register(*vases, max_rotation_deg=10)
     assert angle_deg(found.rotation, np.eye(3)) < 15
 
 
@@ -337,7 +343,7 @@ def test_a_regular_grid_is_laid_on_the_grid(rng):
         (np.zeros((4, 3), complex), "dtype complex128"),
         (np.zeros((4, 3), bool), "dtype bool"),
         ([["a", "b", "c"]] * 4, "dtype <U1"),
-        ([[1, 2, 3], [4, 5]], "no array"),
+        ([[1, 2, 3], [4, 5]], "not an array"),
         (None, "dtype object"),
         (np.full((4, 3), 1e200), "larger unit"),
     ],
@@ -354,9 +360,14 @@ def test_what_is_no_cloud_is_a_clear_error(bad, told):
     ("options", "told"),
     [
         ({"initial": np.eye(3)}, "4x4"),
-        ({"initial": np.diag([2.0, 2, 2, 1])}, "no rigid transform"),
-        ({"initial": np.diag([1.0, 1, -1, 1])}, "no rigid transform"),
+        ({"initial": np.diag([2.0, 2, 2, 1])}, "not a rigid transform"),
+        ({"initial": np.diag([1.0, 1, -1, 1])}, "not a rigid transform"),
         ({"initial": np.full((4, 4), np.nan)}, "NaN"),
+        ({"max_rotation_deg": 0.0}, "above 0 and at most 180"),
+        ({"max_rotation_deg": np.nan}, "above 0 and at most 180"),
+        ({"max_rotation_deg": 181.0}, "leave it out"),
+        ({"config": RegisterConfig(search_points=3)}, "config.search_points must be at least 16"),
+        ({"config": RegisterConfig(inlier_spacings=np.nan)}, "config.inlier_spacings must be pos"),
     ],
 )
 def test_bad_options(options, told):
@@ -366,7 +377,8 @@ def test_bad_options(options, told):
 
 @pytest.mark.untyped
 @pytest.mark.parametrize(
-    "options", [{"rotation": "some"}, {"refine": "magic"}, {"nonfinite": "ignore"}]
+    "options",
+    [{"nonfinite": "ignore"}, {"config": RegisterConfig(refine=RefineConfig(method="magic"))}],
 )
 def test_unknown_options(options):
     with pytest.raises(ValueError, match="must be"):

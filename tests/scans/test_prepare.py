@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxreg.geometry import clouds, frame
 from jaxreg.scans import prepare
-from jaxreg.types import RigidTransform
 
 
 @pytest.fixture
@@ -16,46 +14,26 @@ def rng(seed):
 def test_canonical_form_forgets_order_and_repetition_and_remembers_rows(rng):
     points = rng.integers(-2, 3, (60, 3)).astype(float)
     points[5] = np.nan
-    scan = prepare.make_scan(points, "cloud", nonfinite="drop")
-    assert [tuple(p) for p in scan.points] == sorted({tuple(p) for p in np.delete(points, 5, 0)})
-    np.testing.assert_array_equal(scan.points[scan.row], np.delete(points, 5, 0))
-    rows = prepare.per_input_row(scan, scan.points[:, 0], missing=np.nan)
-    np.testing.assert_array_equal(rows, points[:, 0])
+    scan = prepare.prepare(points, nonfinite="drop")
+    distinct = sorted({tuple(p) for p in np.delete(points, 5, 0)})
+    back = scan.points * scan.radius + scan.centre
+    np.testing.assert_allclose(back, distinct, atol=1e-12)
+    rows = scan.per_input_row(back[:, 0], missing=np.nan)
+    np.testing.assert_allclose(rows, points[:, 0], atol=1e-12)
 
 
 def test_signed_zeros_are_one_number():
-    assert len(prepare.make_scan([[0.0, 0, 0], [-0.0, 0, 0], [1, 1, 1]], "cloud").points) == 2
+    assert len(prepare.prepare([[0.0, 0, 0], [-0.0, 0, 0], [1, 1, 1]]).points) == 2
 
 
 @pytest.mark.parametrize("kind", ["float32", "float16", "int64", list, np.asfortranarray])
 def test_anything_numeric_will_do(rng, kind):
     points = np.round(100 * rng.normal(size=(50, 3)))
     given = points.astype(kind) if isinstance(kind, str) else kind(points)
-    scan = prepare.make_scan(given, "cloud")
+    scan = prepare.prepare(given)
     assert scan.points.dtype == np.float64
-    np.testing.assert_array_equal(scan.points[scan.row], points)
-
-
-def test_frame_and_back(rng):
-    source, reference = rng.normal(size=(50, 3)) + 5e6, 3 * rng.normal(size=(70, 3))
-    where = frame.common_frame(source, reference)
-    radii = [np.sqrt(np.mean(np.sum((x - x.mean(0)) ** 2, axis=1))) for x in (source, reference)]
-    assert where.length == pytest.approx(max(radii))
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    pose = RigidTransform(turn * np.linalg.det(turn), rng.normal(size=3))
-    inner = frame.pose_in(where, pose)
-    x = (source - where.source_centre) / where.length
-    expected = (source @ pose.rotation.T + pose.translation - where.reference_centre) / where.length
-    np.testing.assert_allclose(x @ inner.rotation.T + inner.translation, expected, atol=1e-8)
-    np.testing.assert_allclose(
-        frame.pose_out(where, inner).translation, pose.translation, atol=1e-8
-    )
-
-
-def test_rounding_of_an_offset_is_no_shape():
-    points = np.full((10, 3), 5e6)
-    points[::2] += 1e-9
-    assert frame.common_frame(points, points).length == 1
+    back = scan.points[scan.row] * scan.radius + scan.centre
+    np.testing.assert_allclose(back, points, atol=1e-10)
 
 
 def test_voxels_against_a_loop(rng):
@@ -85,23 +63,55 @@ def test_spacing_of_a_grid_is_its_edge():
     grid = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0]), axis=-1).reshape(-1, 3)
     assert prepare.spacing(0.25 * grid) == pytest.approx(0.25)
     assert prepare.spacing(1e-12 * grid) == pytest.approx(1e-12)  # in whatever unit
-    assert prepare.at_one_density(*2 * [np.zeros((5, 3))], 9)[2] == pytest.approx(1e-6)
+
+
+def test_a_stray_row_does_not_overflow_the_numbers_of_the_cubes(rng):
+    """Cells farther apart than int64 has numbers for their products."""
+    points = np.concatenate([rng.normal(size=(3000, 3)), 1e14 * np.eye(3)])
+    size = 1e-4
+    cells = {tuple(np.floor((p - points.min(axis=0)) / size).astype(int)) for p in points}
+    assert len(prepare.voxel_reduced(points, size)) == len(cells)
+
+
+def test_clouds_of_unlike_density_are_thinned_to_one(rng):
+    dense = rng.uniform(size=(4000, 3)) * [1, 1, 0]
+    sparse = rng.uniform(size=(250, 3)) * [1, 1, 0]
+    for scale in (1.0, 250.0):
+        clouds = [prepare.prepare(scale * p) for p in (dense, sparse)]
+        levels = prepare.at_one_density(*clouds)
+        spacings = [
+            level.spacing * cloud.radius for level, cloud in zip(levels, clouds, strict=True)
+        ]
+        assert max(spacings) < 1.4 * min(spacings)
+        assert levels[1] is clouds[1].coarse
+        assert prepare.at_one_density(*clouds)[0] is levels[0]  # made once
+
+
+def test_normals_that_are_given_are_used_and_found_ones_are_not(rng):
+    plane = rng.uniform(-1, 1, size=(300, 3)) * [1, 1, 0]
+    given = np.tile([0.0, 3.0, 4.0], (300, 1))
+    index = prepare.prepare(plane, normals=given).fine.index
+    np.testing.assert_allclose(index.host_normals, given / 5, atol=1e-6)
+    found = prepare.prepare(plane).fine.index.host_normals
+    np.testing.assert_allclose(np.abs(found[:, 2]), 1, atol=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("count", "size"), [(1, 128), (128, 128), (129, 256), (1000, 1024), (9999, 2048)]
+    ("normals", "message"),
+    [
+        (np.zeros((4, 3)), r"the normals of cloud have shape \(4, 3\): give one for each of its 5"),
+        (np.full((5, 3), np.nan), "normal 0 of cloud is not finite"),
+        ([["a"] * 3] * 5, "the normals of cloud has dtype"),
+    ],
 )
-def test_buckets(count, size):
-    assert clouds.bucket(count, smallest=128, largest=2048) == size
+def test_wrong_normals_are_named(rng, normals, message):
+    with pytest.raises(ValueError, match=message):
+        prepare.prepare(rng.normal(size=(5, 3)), normals=normals)
 
 
-def test_padding():
-    rows, mask = clouds.padded(np.ones((3, 3)), 8)
-    assert rows.dtype == np.float32
-    np.testing.assert_array_equal(mask, [1, 1, 1, 0, 0, 0, 0, 0])
-    assert not rows[3:].any()
-
-
-def test_nearest_rotation_of_a_mirror_is_a_rotation():
-    turned = frame.nearest_rotation(np.diag([1.0, 1, -1]))
-    assert np.linalg.det(turned) == pytest.approx(1)
+def test_quantised_values_are_near_and_few():
+    values = np.geomspace(1e-90, 1e90, 4001)
+    steps = np.array([prepare.in_steps(value) for value in values])
+    assert np.abs(np.log2(steps / values)).max() <= 1 / 8 + 1e-12
+    assert len(np.unique(steps)) < 4.1 * np.log2(1e180)
+    assert prepare.in_steps(0.0) == 0.0

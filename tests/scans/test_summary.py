@@ -1,14 +1,19 @@
 """A registration in words and figures."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import summary
 from jaxreg.scans.pair import ScanRegistration
 from jaxreg.scans.verdict import Evidence
+
+SLIDE = WeakDirection("translation", np.array([1.0, 0, 0]), np.zeros(3), 1e-4)
+TURN = WeakDirection("rotation", np.array([0.0, 0, 1]), np.zeros(3), 2e-4)
 
 
 @pytest.fixture
@@ -21,16 +26,18 @@ def result(seed):
         transformation=np.eye(4),
         confidence=np.array([0.0, 1.0, 0.5]),
         correspondences=np.full((3, 3), np.nan),
-        reach=0.1,
+        max_correspondence_distance=0.1,
+        reason="" if False else "Only 60% of the points lie near the other cloud.",
+        alternatives=(),
+        converged=True,
         fitness=0.8,
         inlier_rmse=0.02,
         overlap=0.6,
         covariance=np.diag([1e-6, 4e-6, 1e-6, 1e-4, 9e-4, 1e-4]),
-        weak_directions=("one", "another"),
+        weak_directions=(SLIDE, TURN),
         success=False,
         probability=0.25,
         evidence=Evidence(0.6, 0.5, np.inf, 0.0, 0.3, 0.2),
-        seconds=1.0,
         dropped=2,
     )
 
@@ -39,7 +46,7 @@ def test_verdict_says_which_and_how_sure(result):
     assert (
         summary.verdict_line(result) == "not trustworthy (probability 0.25 that the pose is right)"
     )
-    good = result._replace(success=True, probability=0.9)
+    good = dataclasses.replace(result, success=True, probability=0.9)
     assert summary.verdict_line(good) == "success (probability 0.90)"
 
 
@@ -49,14 +56,18 @@ def test_figures_have_units(result):
     assert told["rotation"] == f"{degrees:.3f} deg"
     # The largest standard deviations: 2e-3 rad and 0.03.
     assert told["one sigma"] == f"{np.degrees(2e-3):.2g} deg, 0.03"
-    assert told["weak directions"] == "one\nanother"
+    assert told["weak directions"] == f"{SLIDE.name}\n{TURN.name}"
     assert told["translation"] == "1000000, -2, 0.5"
 
 
 def test_nothing_is_claimed_without_a_refinement(result):
-    told = summary.figures(result._replace(covariance=np.full((6, 6), np.nan), weak_directions=()))
+    told = summary.figures(
+        dataclasses.replace(result, covariance=np.full((6, 6), np.nan), weak_directions=())
+    )
     assert told["one sigma"] == told["weak directions"] == summary._UNKNOWN
-    exact = summary.figures(result._replace(covariance=np.zeros((6, 6)), weak_directions=()))
+    exact = summary.figures(
+        dataclasses.replace(result, covariance=np.zeros((6, 6)), weak_directions=())
+    )
     assert (exact["one sigma"], exact["weak directions"]) == ("0 deg, 0", "none")
 
 

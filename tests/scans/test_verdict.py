@@ -4,16 +4,21 @@ import numpy as np
 import pytest
 
 from jaxreg.data.procedural import shapes
-from jaxreg.refine.kdtree import index_cloud
 from jaxreg.scans import prepare, verdict
+from jaxreg.scans.config import RegisterConfig
 from jaxreg.types import RigidTransform
 
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 
 def indexed(source, reference):
-    x, y, spacing = prepare.at_one_density(source, reference, 512)
-    return index_cloud(x, neighbors=10), index_cloud(y, neighbors=10), spacing
+    clouds = [
+        prepare.prepare(points, config=RegisterConfig(search_points=512))
+        for points in (source, reference)
+    ]
+    levels = prepare.at_one_density(*clouds)
+    spacing = max(level.spacing * cloud.radius for level, cloud in zip(levels, clouds, strict=True))
+    return *((level, cloud.radius) for level, cloud in zip(levels, clouds, strict=True)), spacing
 
 
 @pytest.fixture(scope="module")

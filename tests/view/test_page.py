@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
+from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans.pair import ScanRegistration
 from jaxreg.scans.verdict import Evidence
 from jaxreg.view import page
@@ -25,16 +26,18 @@ def registration(source, reference, *, rotation=POSE, translation=(0.0, 0, 0), s
         transformation=np.block([[rotation, translation[:, None]], [0, 0, 0, 1]]),
         confidence=np.linspace(0, 1, len(source)),
         correspondences=source @ rotation.T + translation,
-        reach=0.1,
+        max_correspondence_distance=0.1,
+        reason="" if success else "Only 60% of the points lie near the other cloud.",
+        alternatives=(),
+        converged=True,
         fitness=0.75,
         inlier_rmse=0.01,
         overlap=0.5,
         covariance=np.eye(6) * 1e-6,
-        weak_directions=("rotation about axis (0.00, 0.00, 1.00)",),
+        weak_directions=(WeakDirection("rotation", np.array([0.0, 0, 1]), np.zeros(3), 1e-4),),
         success=success,
         probability=0.97 if success else 0.03,
         evidence=Evidence(0.5, 0.5, 1.0, 0.0, 0.3, 0.2),
-        seconds=0.5,
         dropped=0,
     )
 
