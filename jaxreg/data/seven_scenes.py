@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
+
+from jaxreg.io import read_cloud
 
 SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 TEST_SCENE = "office"
@@ -112,20 +113,12 @@ def read_fragment(path: Path) -> np.ndarray:
     """The vertices (n, 3) of a PLY file, float64, in its own unit (metres).
 
     Raises:
-      ValueError: the file is missing, not PLY, truncated, empty, or has a non-finite vertex.
+      ValueError: as `read_cloud`, or the file has a non-finite vertex.
     """
-    try:
-        vertex = PlyData.read(str(path))["vertex"]
-        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path} cannot be read as PLY with vertices x, y, z ({error}): download it again."
-        ) from None
-    if len(points) == 0:
-        raise ValueError(f"{path} holds no point: download it again, or remove it.")
+    points = read_cloud(path)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if bad.size:
-        raise ValueError(f"{path}: vertex {bad[0]} is not finite: download it again, or mend it.")
+        raise ValueError(f"{path}: vertex {bad[0]} is not finite: download the file again.")
     return points
 
 

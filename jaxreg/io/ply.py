@@ -13,7 +13,7 @@ def read(path: Path) -> np.ndarray:
         return np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     except KeyError:
         raise ValueError(
-            f"{path} has no element 'vertex': it is no point cloud; export it again."
+            f"{path} has no element 'vertex': it is not a point cloud; export it again."
         ) from None
     except ValueError as error:
         missing = "no field" in str(error)

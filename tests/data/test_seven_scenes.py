@@ -152,12 +152,12 @@ def test_truncated_ply(kept, text, tmp_path):
     path = write_fragment(tmp_path, 0, np.ones((50, 3)) * 0.123, text=text)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(ValueError, match=r"cloud_bin_0\.ply cannot be read as PLY .*download"):
+    with pytest.raises(ValueError, match=r"cloud_bin_0\.ply.*(empty|truncated).*again"):
         seven_scenes.read_fragment(path)
 
 
 def test_malformed_fragments(tmp_path):
-    with pytest.raises(ValueError, match=r"cloud_bin_7\.ply cannot be read as PLY"):
+    with pytest.raises(ValueError, match=r"cloud_bin_7\.ply: there is no such file"):
         seven_scenes.read_fragment(tmp_path / "cloud_bin_7.ply")
     path = write_fragment(tmp_path, 0, np.zeros((0, 3)))
     with pytest.raises(ValueError, match=r"cloud_bin_0\.ply holds no point"):
@@ -167,7 +167,7 @@ def test_malformed_fragments(tmp_path):
         seven_scenes.read_fragment(path)
     vertex = np.zeros(3, dtype=[("x", "f4"), ("y", "f4")])
     PlyData([PlyElement.describe(vertex, "vertex")]).write(path)
-    with pytest.raises(ValueError, match="cannot be read as PLY with vertices x, y, z"):
+    with pytest.raises(ValueError, match="vertices lack x, y or z"):
         seven_scenes.read_fragment(path)
 
 
