@@ -187,27 +187,28 @@ def _searched(
     size = clouds.bucket(max(len(x), len(y)), smallest=_SMALLEST, largest=config.search_points)
     unmoved = frame.pose_in(where, RigidTransform(np.eye(3), np.zeros(3)))
     largest = 180.0 if rotation == "full" else config.limited_deg
-    poses, score = _search(config.learned)(
+    found = _search(config.learned)(
         *clouds.padded(x, size),
         *clouds.padded(y, size),
         # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
         RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved)),
         np.float32(np.radians(largest)),
     )
-    poses, score = RigidTransform(*(np.asarray(p, np.float64) for p in poses)), np.asarray(score)
-    best = int(np.argmax(score - _PREFERENCE * _angles(poses, np.eye(3)) / np.pi))
+    poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
+    score, allowed = np.asarray(found.score), np.asarray(found.allowed)
+    usable = allowed if allowed.any() else np.ones_like(allowed)
+    preferred = score - _PREFERENCE * _angles(poses, np.eye(3)) / np.pi
+    best = int(np.argmax(np.where(usable, preferred, -np.inf)))
     apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
     others = (_angles(poses, poses.rotation[best]) > np.radians(15)) | (apart > 0.2)
-    # A pose that turns too far is no rival: it was ruled out, and its score says only that.
-    allowed = _angles(poses, np.eye(3)) <= np.radians(largest) + 1e-2
-    others &= allowed | ~allowed[best]
+    others &= usable  # A pose that turns too far is no rival: it was ruled out.
     lead = score[best] - score[others].max() if others.any() else verdict.NO_RIVAL
     return RigidTransform(poses.rotation[best], poses.translation[best]), float(lead)
 
 
 @functools.cache
 def _search(learned: bool):
-    def run(network, x, x_mask, y, y_mask, also, largest_angle):
+    def run(network, x, x_mask, y, y_mask, also, max_angle):
         return search_poses(
             x,
             y,
@@ -215,7 +216,7 @@ def _search(learned: bool):
             reference_mask=y_mask,
             network=network,
             also=also,
-            largest_angle=largest_angle,
+            max_angle=max_angle,
         )
 
     network = jax.device_put(load_network()) if learned else None

@@ -1,10 +1,21 @@
-"""Registration for any rotation, of clouds that share no point: `register_global`.
+"""Registration without a start, of clouds that share no point: `register_global`.
 
 Every stage is dense and of a fixed shape: products of (n, n) matrices instead of neighbour lists,
 one hypothesis from each of the clearest candidates instead of sampling, a grid instead of a tree.
 """
 
+from jaxreg.search.config import SearchConfig
+from jaxreg.search.description import Described, describe
 from jaxreg.search.learned import load_network
-from jaxreg.search.pipeline import register_global
+from jaxreg.search.pipeline import Search, register_global, search_described, search_poses
 
-__all__ = ["load_network", "register_global"]
+__all__ = [
+    "Described",
+    "Search",
+    "SearchConfig",
+    "describe",
+    "load_network",
+    "register_global",
+    "search_described",
+    "search_poses",
+]
