@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py) benchmarks research examples
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help demo test coverage slow lint types fuzz mutants tables figures baselines clean
+.PHONY: help demo test coverage slow lint types fuzz mutants tables figures docs baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -45,8 +45,11 @@ tables: $(VENV)/.installed-baselines  ## figures of the released weights and of 
 figures: $(VENV)/.installed  ## the pictures of the documentation
 	$(BIN)/python -m benchmarks.figures
 
+docs: $(VENV)/.installed-docs  ## build the site; open site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:  ## remove the environment, caches and runs
-	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*
+	rm -rf $(VENV) runs build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache .coverage*
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -64,4 +67,8 @@ $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-baselines: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable ".[baselines]"
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[docs]"
 	@touch $@ $(VENV)/.installed

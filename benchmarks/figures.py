@@ -1,12 +1,13 @@
 """Every picture of the documentation, from procedural shapes and the released weights.
 
-    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos]
+    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos search]
     python -m benchmarks.figures --only drift --runs runs/drift_default runs/drift_batch4 ...
 
 `pairs` and `noise`: pairs before and after, with the inlier confidence as colour. `matches`: the
 best match of points at the first step with the 1-NN cloud, with every point in the place of its own
 1-NN, and with a single neighbourhood, all with the same weights. `arccos`: the published form of
-MIE(R) beside the true angle. `drift`: validation errors of runs of train.py.
+MIE(R) beside the true angle. `search`: the stages of the search. `drift`: validation errors of runs of
+train.py.
 """
 
 import dataclasses
@@ -23,6 +24,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
+from benchmarks.search_figure import draw_search
 from jaxreg._xla import jit
 from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import ModelConfig, PairConfig
@@ -51,7 +53,7 @@ class Options:
     """Which pictures, and where to."""
 
     folder: str = "docs/images"
-    only: tuple[str, ...] = ("pairs", "noise", "matches", "arccos")
+    only: tuple[str, ...] = ("pairs", "noise", "matches", "arccos", "search")
     weights: str = "modelnet40"
     seed: int = 0
     runs: tuple[str, ...] = ()
@@ -248,6 +250,8 @@ def draw(name: str, options: Options) -> None:
         robust = dataclasses.replace(load_pretrained(options.weights)[1].model, robust_rounds=3)
         title = '"Gaussian noise": 200 outliers appended to each cloud'
         draw_pairs(register(pairs, options.weights, robust), labels, path, title)
+    elif name == "search":
+        draw_search(path)
     else:
         {"matches": draw_matches, "arccos": draw_arccos, "drift": draw_drift}[name](options, path)
     print(path, flush=True)

@@ -38,13 +38,13 @@ from jaxreg.network.inliers import InlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import match, matching_maps, neighborhood_sum
 from jaxreg.network.model import neighborhood_graph
-from jaxreg.search.config import SearchConfig
+from jaxreg.search import description
 from jaxreg.search.learned import load_network
-from jaxreg.search.pipeline import enter, search_poses, surfaces
+from jaxreg.search.pipeline import enter, search_poses
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from research import train_features as learned_features
 
-_DENSE, _MODEL = SearchConfig(), ModelConfig()
+_MODEL = ModelConfig()
 TESTED = ("resampled", "resampled_jitter", "crops70")
 
 
@@ -98,9 +98,9 @@ class Described(NamedTuple):
 
 def describe(network, source, reference) -> Described:
     """What is the same for all rows."""
-    where, x, y = enter(source, reference, None, None, _DENSE)
-    masks = [jnp.ones(len(p), bool) for p in (x, y)]
-    return Described(x, y, surfaces(x, y, *masks, _DENSE, network)[2], where)
+    where, x, y = enter(source, reference)
+    both = (description.describe(points, unit=1.0) for points in (x, y))
+    return Described(x, y, description.compare(*both, network=network).similarity, where)
 
 
 def register_step(weights, described: Described, row: Row, *, train: bool):

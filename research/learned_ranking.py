@@ -33,9 +33,10 @@ from jaxreg.data import data_root, modelnet
 from jaxreg.data.procedural import shapes
 from jaxreg.evaluation.metrics import pair_errors
 from jaxreg.search.config import SearchConfig
+from jaxreg.search.description import compare, describe
 from jaxreg.search.nearest import nearest_packed
-from jaxreg.search.pipeline import search_poses, surfaces
-from jaxreg.search.ranking import evidence, move
+from jaxreg.search.pipeline import search_poses
+from jaxreg.search.ranking import move, score_terms
 from jaxreg.search.surface import Surface
 from jaxreg.types import Pair, RigidTransform
 
@@ -88,23 +89,17 @@ def facts(moved: Surface, other: Surface) -> jax.Array:
 
 def choices(options: Options):
     """A compiled function of a pair: the poses of the search and everything known about them."""
-    config = dataclasses.replace(SearchConfig(), unit=1.0, aligned=options.aligned, doubt=0.0)
+    config = dataclasses.replace(SearchConfig(), unit=1.0, aligned=options.aligned)
 
     def found(x: jax.Array, y: jax.Array):
         search = search_poses(x, y, config=config)
-        source, reference, _ = surfaces(x, y, None, None, config)
+        described = (describe(points, unit=1.0) for points in (x, y))
+        source, reference, _ = compare(*described)
 
         def judge(pose: RigidTransform):
             moved = move(pose, source)
-            terms = evidence(
-                pose,
-                source,
-                reference,
-                width=config.match_width,
-                plane_width=config.plane_width,
-                rim=config.rim,
-            )
-            weighed = jnp.stack(terms[:4])  # What `plausibility` weighs: all but `flush`.
+            terms = score_terms(pose, source, reference)
+            weighed = jnp.stack(terms[:4])  # What `score_of` weighs: all but `plane`.
             return facts(moved, reference), facts(reference, moved), weighed
 
         return search, jax.lax.map(judge, search.poses)

@@ -38,13 +38,13 @@ from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import nearest_neighbor, squared_distances
 from jaxreg.geometry.numerics import safe_norm
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.descriptors import moment_descriptors, standardized
+from jaxreg.search.description import compare, describe
+from jaxreg.search.descriptors import standardized
 from jaxreg.search.learned import init_network, load_network
-from jaxreg.search.pipeline import enter, search_poses, surfaces
+from jaxreg.search.pipeline import enter, search_poses
 from jaxreg.weights.released import save_weights
 
 KINDS = ("crops70", "crops70_jitter", "crops50")
-_DENSE = SearchConfig()
 _SAME, _APART = 0.06, 0.12
 """A match is right within the first distance (unit sphere); up to the second it is neither."""
 
@@ -73,10 +73,7 @@ class Options:
 
 def linear_cosines(matrix, x, y, x_mask, y_mask) -> jax.Array:
     """Cosines of the moments under a matrix."""
-    found = [
-        moment_descriptors(p, mask, radii=_DENSE.radii, normal_radius=_DENSE.normal_radius).features
-        for p, mask in ((x, x_mask), (y, y_mask))
-    ]
+    found = [describe(p, mask, unit=1.0).features for p, mask in ((x, x_mask), (y, y_mask))]
     mapped = [f @ matrix for f in standardized(*found, x_mask, y_mask)]
     one, other = (f / jnp.maximum(safe_norm(f), 1e-6)[:, None] for f in mapped)
     return one @ other.T
@@ -84,7 +81,8 @@ def linear_cosines(matrix, x, y, x_mask, y_mask) -> jax.Array:
 
 def network_cosines(network, x, y, x_mask, y_mask) -> jax.Array:
     """Cosines of the features of the library; of the moments, where `network` is None."""
-    return surfaces(x, y, x_mask, y_mask, _DENSE, network)[2]
+    described = (describe(p, mask, unit=1.0) for p, mask in ((x, x_mask), (y, y_mask)))
+    return compare(*described, network=network).similarity
 
 
 def one_nn_cosines(network, x, y, x_mask, y_mask) -> jax.Array:
@@ -147,7 +145,7 @@ def fit(name: str, clouds: np.ndarray, options: Options) -> Any:
             for k, p in zip(jax.random.split(key), (x, y), strict=True)
         ]
         squared = squared_distances(rigid.apply(pair.transform, x), y)
-        _, x, y = enter(x, y, *masks, _DENSE)
+        _, x, y = enter(x, y, *masks)
         cosines = COSINES[name](weights["features"], x, y, *masks)
         return contrastive_loss(cosines, jnp.exp(weights["log_sharpness"]), squared, *masks)
 
@@ -191,7 +189,7 @@ def search(name: str, weights: Any):
     @_xla.jit
     def found(x, y, truth):
         masks = [jnp.ones(len(p), bool) for p in (x, y)]
-        _, a, b = enter(x, y, *masks, _DENSE)
+        _, a, b = enter(x, y, *masks)
         cosines = COSINES[name](weights, a, b, *masks)
         squared = squared_distances(rigid.apply(truth, x), y)
         has = jnp.min(squared, axis=1) < _SAME**2
@@ -257,7 +255,7 @@ def main() -> None:
             "steps": options.steps,
             "batch": options.batch,
         }
-        save_weights(options.save, "features", trained["network"], _DENSE, card)
+        save_weights(options.save, "features", trained["network"], SearchConfig(), card)
     if "network" in trained:
         trained["network, 1-NN"] = trained["network"]
     for label, chosen in clouds_to_test_on(options).items():

@@ -31,8 +31,8 @@ point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames=(*_SOLV
 gicp = jax.jit(
     _gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness", "partners", "edges")
 )
-moment_descriptors = jax.jit(
-    descriptors.moment_descriptors, static_argnames=("radii", "normal_radius")
-)
+gaussian_normals = jax.jit(descriptors.gaussian_normals, static_argnames="radius")
+moments = jax.jit(descriptors.moments, static_argnames="radii")
+mean_spacing = jax.jit(descriptors.mean_spacing)
 standardized = jax.jit(descriptors.standardized)
 openness = jax.jit(descriptors.openness, static_argnames="radius")

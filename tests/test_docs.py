@@ -1,10 +1,10 @@
 """The guides and the notebook run as they stand and print what they say.
 
-`python tests/test_docs.py` runs the guides and writes what they print into them.
+`python -m tests.test_docs [NAME ...]` runs the guides and the README and writes what they print into
+them.
 """
 
 import contextlib
-import io as streams
 import json
 import os
 import re
@@ -14,72 +14,20 @@ import sys
 import types
 from pathlib import Path
 
-import jax
-import numpy as np
 import pytest
 
-from jaxreg.cli import main, process
+from jaxreg.cli import process
 from jaxreg.config import load_config
+from tests.pages import BLOCK, compare, run_blocks, run_python
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
 
 ROOT = Path(__file__).parents[1]
-PAGES = {path.stem: path for path in sorted((ROOT / "docs").glob("*.md")) if path.stem != "README"}
+DOCS = {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
+PAGES = {name: path for name, path in DOCS.items() if BLOCK.search(path.read_text("utf-8"))}
 # What these need is compiled by no other test; the other pages run in every suite.
 SLOW = ("read-the-results", "use-it-inside-your-jax-code")
 NOTEBOOKS = {path.stem: path for path in sorted((ROOT / "examples").glob("*.ipynb"))}
-BLOCK = re.compile(r"```(python|sh)\n(.*?)```\n(?:\n```\n(.*?)```\n)?", re.DOTALL)
-
-
-def run_python(code: str, names: dict) -> str:
-    # Readers write `points + translation`, as the field does.
-    with (
-        contextlib.redirect_stdout(streams.StringIO()) as printed,
-        jax.numpy_rank_promotion("allow"),
-    ):
-        exec(compile(code, "example", "exec"), names)  # noqa: S102
-    return printed.getvalue()
-
-
-def run_shell(code: str) -> str | None:
-    """What lines `jaxreg ...` and `echo $?` print; None for other programs, which are not run."""
-    if not code.startswith("jaxreg "):
-        return None
-    status = 0
-    with (
-        contextlib.redirect_stdout(streams.StringIO()) as printed,
-        contextlib.redirect_stderr(printed),
-    ):
-        for line in code.splitlines():
-            if line == "echo $?":
-                print(status)
-            else:
-                status = main(shlex.split(line)[1:])
-    return printed.getvalue()
-
-
-def run_blocks(text: str):
-    """The match, and what was printed (None where nothing was run), of every block of a page."""
-    names = {}
-    for match in BLOCK.finditer(text):
-        kind, code, _ = match.groups()
-        yield match, run_python(code, names) if kind == "python" else run_shell(code)
-
-
-def comparable(text: str) -> tuple[list[str], np.ndarray]:
-    """The words, and the numbers, of lines that do not tell a time."""
-    lines = [line for line in text.splitlines() if not re.search(r"^time|seconds|\bs$", line)]
-    numbers = re.findall(r"(?<![\w.])-?\d[\d,]*\.?\d*(?:e[-+]?\d+)?", "\n".join(lines))
-    words = re.findall(r"[A-Za-z]{3,}", "\n".join(lines))
-    return words, np.array([float(number.replace(",", "")) for number in numbers])
-
-
-def compare(promised: str, printed: str) -> None:
-    """Equal words; numbers that differ by no more than another machine's rounding may cause."""
-    (words, numbers), (other_words, others) = comparable(promised), comparable(printed)
-    assert words == other_words, printed
-    assert numbers.shape == others.shape, printed
-    np.testing.assert_allclose(others, numbers, rtol=0.1, atol=0.05, err_msg=printed)
 
 
 def forms(text: str) -> set[str]:
@@ -148,26 +96,25 @@ def test_notebooks_print_what_they_show(folder, name, monkeypatch):
     assert ran >= 4
 
 
-@pytest.mark.parametrize(
-    "path", [*PAGES.values(), ROOT / "docs" / "README.md"], ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("path", DOCS.values(), ids=DOCS)
 def test_links_and_configurations_of_guides_exist(path):
     text = path.read_text(encoding="utf-8")
-    for name in re.findall(r"\]\(([^)h#][^)#]*)", text):
+    for name in re.findall(r"\]\((?!https?:|#)([^)#]+)", text):
         assert (path.parent / name).exists(), name
     for name in re.findall(r"configs/\w+\.toml", text):
         load_config(ROOT / name)
 
 
 def write_pages() -> None:
-    """Run every guide in a folder of its own and put what it printed below each block.
+    """Run every page, and the README, in a folder of its own and put what it printed below each block.
 
     Run it twice: the second time nothing is compiled, and the seconds are those of a usual run.
     """
     import tempfile
 
     process.enable_compilation_cache(least_seconds=0.0)
-    for path in PAGES.values():
+    chosen = sys.argv[1:] or [*PAGES, "README"]
+    for path in [(PAGES | {"README": ROOT / "README.md"})[name] for name in chosen]:
         text, pieces, end = path.read_text(encoding="utf-8"), [], 0
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
             for match, printed in run_blocks(text):

@@ -17,7 +17,7 @@ from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, wea
 from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
-from jaxreg.search.learned import load_features
+from jaxreg.search.learned import load_network as load_features
 from jaxreg.search.pipeline import search_described
 from jaxreg.types import RigidTransform
 
@@ -29,8 +29,6 @@ equally (a symmetric shape) the one that turns least is taken."""
 _RIVAL_DEG, _RIVAL_DISTANCE = 15.0, 0.2
 """A pose that turns by more than this from the chosen one, or moves the source's centroid farther away
 (in the unit of the frame), is another pose and no variant of it."""
-_ANGLE_SLACK = 1e-2
-"""Radians by which a refined pose may exceed `max_rotation_deg`."""
 
 
 class Alternative(NamedTuple):
@@ -201,11 +199,10 @@ def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig)
 def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
     """The most plausible pose, and how much more plausible it is than the next that differs."""
     where, most = problem.where, math.radians(max_rotation_deg or 180.0)
-    poses, score = _searched_poses(problem, most)
+    poses, score, allowed = _searched_poses(problem, most)
     turned = np.radians(rotation_angle_deg(poses.rotation, np.eye(3)[None]))
-    allowed = (turned <= most + _ANGLE_SLACK) & np.isfinite(score)
     # Where no pose is allowed, the best of the others is at least an answer.
-    allowed = allowed if allowed.any() else np.isfinite(score)
+    allowed = allowed if allowed.any() else np.ones_like(allowed)
     best = int(np.argmax(np.where(allowed, score, -np.inf) - _TURN_COST * turned / np.pi))
     apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
     angle = rotation_angle_deg(poses.rotation, poses.rotation[best][None])
@@ -219,8 +216,8 @@ def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
     return _Found(_nth(poses, best), rival, alternatives)
 
 
-def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.ndarray]:
-    """The poses of the search in the frame of the pair, in float64, and their scores."""
+def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
+    """The poses of the search in the frame of the pair, in float64, their scores, which are allowed."""
     where, config = problem.where, problem.config
     # Twice the radius: a usual shape then fills the unit sphere.
     unit = prepare.in_steps(2 * float(where.length))
@@ -237,7 +234,8 @@ def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.
     found = _program(config)(*described, also, np.float32(most))
     poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
     scale = unit / float(where.length)
-    return poses._replace(translation=poses.translation * scale), np.asarray(found.score)
+    poses = poses._replace(translation=poses.translation * scale)
+    return poses, np.asarray(found.score), np.asarray(found.allowed)
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.pipeline import Described, describe
+from jaxreg.search.description import Described, describe
 
 FINEST = 1e-6
 """The resolution of float32 in a cloud of radius 1: a spacing below it is none."""

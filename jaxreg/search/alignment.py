@@ -16,22 +16,31 @@ from jaxreg.search.nearest import NearestGrid, lookup, nearest_packed
 from jaxreg.search.surface import Surface
 from jaxreg.types import RigidTransform
 
+COARSE_WIDTHS = (0.15, 0.12, 0.09, 0.07, 0.05)
+"""Gaussian width of every coarse iteration, in units of the search."""
+COARSE_EPSILON = 0.1
+"""Weight of the distance along a surface, against that across it: large, since few poses are near."""
+FINE_WIDTHS = (0.1, 0.07, 0.05, 0.05)
+"""Gaussian width of every fine iteration, in units of the search."""
+FINE_EPSILON = 0.01
+"""GICP's epsilon: variance across a surface, in units of the variance along it."""
+
 
 def align_coarse(
     pose: RigidTransform,
     source: Surface,
     reference: Surface,
     grid: NearestGrid,
-    widths: tuple[float, ...],
     *,
-    thickness: float,
+    widths: tuple[float, ...] = COARSE_WIDTHS,
+    epsilon: float = COARSE_EPSILON,
 ) -> RigidTransform:
     """One Gauss-Newton step for each of `widths`; neighbours from the grid, source to reference.
 
-    The metric ``n n^T + thickness I`` is that of point to plane, held where planes would slide.
+    The metric ``n n^T + epsilon I`` is that of point to plane, held where planes would slide.
     """
     outer = reference.normals[:, :, None] * reference.normals[:, None, :]
-    metric = outer + thickness * jnp.eye(3, dtype=outer.dtype)[None]
+    metric = outer + epsilon * jnp.eye(3, dtype=outer.dtype)[None]
 
     def step(pose: RigidTransform, width: Array):
         moved = rigid.apply(pose, source.points)
@@ -48,20 +57,20 @@ def align_fine(
     pose: RigidTransform,
     source: Surface,
     reference: Surface,
-    widths: tuple[float, ...],
     *,
-    thickness: float,
+    widths: tuple[float, ...] = FINE_WIDTHS,
+    epsilon: float = FINE_EPSILON,
 ) -> RigidTransform:
     """Generalised ICP in both directions, one Gauss-Newton step for each of `widths`.
 
     Minimises ``sum w r^T (C_y + R C_x R^T)^-1 r`` with the covariances of planes, 1 along and
-    `thickness` across, and ``w = exp(-|r|^2 / (2 width^2))``, over every source point with its
+    `epsilon` across, and ``w = exp(-|r|^2 / (2 width^2))``, over every source point with its
     nearest reference point and every reference point with its nearest source point.
 
     Differentiable in the points and normals; which point is nearest is a constant.
     """
-    covariances = surface_covariances(source.normals, thickness)
-    others = surface_covariances(reference.normals, thickness)
+    covariances = surface_covariances(source.normals, epsilon)
+    others = surface_covariances(reference.normals, epsilon)
     rows, columns = (jnp.arange(len(s.mask), dtype=jnp.int32) for s in (source, reference))
     # Both masks count in both directions: with an empty cloud there is no pair at all.
     usable = jnp.any(source.mask) & jnp.any(reference.mask)
@@ -74,7 +83,7 @@ def align_fine(
         i, j = jnp.concatenate([rows, backward]), jnp.concatenate([forward, columns])
         turned = jnp.matmul(pose.rotation, covariances, precision=Precision.HIGHEST)
         turned = jnp.matmul(turned, pose.rotation.T, precision=Precision.HIGHEST)
-        metric = 2 * thickness * eigen3x3.inverse(turned[i] + others[j])
+        metric = 2 * epsilon * eigen3x3.inverse(turned[i] + others[j])
         residual = moved[i] - reference.points[j]
         weight = jnp.where(valid, _closeness(residual, width), 0)
         weighted = weight[:, None, None] * metric

@@ -15,8 +15,10 @@ class Candidates(NamedTuple):
     mask: Bool[Array, "c"]
 
 
+MATCHES = 3
+"""Most similar points of every point that become candidates, in both directions."""
 _MUTUAL_BONUS = 0.05
-"""Of the margin, for being each other's best match (cosines are in [-1, 1])."""
+"""Added to the margin of two points that are each other's best match (cosines are in [-1, 1])."""
 
 
 def select_candidates(
@@ -24,8 +26,8 @@ def select_candidates(
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
     *,
-    matches: int,
     keep: int,
+    matches: int = MATCHES,
 ) -> Candidates:
     """The `keep` clearest of the best `matches` of every row and of every column.
 
@@ -48,18 +50,21 @@ def select_candidates(
         valid = valid & source_mask[:, None]
     if reference_mask is not None:
         valid = valid & reference_mask[None, :]
-    similarity = jnp.where(valid, similarity, -2)
+    similarity = jnp.where(valid, similarity, -jnp.inf)
     by_row, column = _best(similarity, matches)
     by_column, row = _best(similarity.T, matches)
     rows, columns = (jnp.repeat(jnp.arange(x, dtype=row.dtype), matches) for x in (n, m))
     source = jnp.concatenate([rows, row.reshape(-1)])
     reference = jnp.concatenate([column.reshape(-1), columns])
     value = similarity[source, reference]
-    margins = [(best[:, :-1] - best[:, -1:]).reshape(-1) for best in (by_row, by_column)]
+    # Where nothing else is valid, the margin is that over the least of cosines.
+    margins = [
+        (best[:, :-1] - jnp.maximum(best[:, -1:], -1)).reshape(-1) for best in (by_row, by_column)
+    ]
     mutual = (value >= by_row[source, 0]) & (value >= by_column[reference, 0])
     clarity = jnp.concatenate(margins) + jnp.where(mutual, _MUTUAL_BONUS, 0)
     listed = (jnp.arange(value.shape[0]) >= n * matches) & (value >= by_row[source, matches - 1])
-    clarity = jnp.where(listed | (value <= -2), -jnp.inf, clarity)
+    clarity = jnp.where(listed | jnp.isneginf(value), -jnp.inf, clarity)
     clarity, chosen = jax.lax.top_k(clarity, keep)
     return Candidates(
         source[chosen].astype(jnp.int32),

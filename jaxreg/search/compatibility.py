@@ -11,6 +11,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry.numerics import safe_norm, safe_sqrt
 
+DISTANCE_TOLERANCE = 0.08
+"""Change of a distance, in units of the search, at which two candidates stop being compatible."""
+COSINE_TOLERANCE = 0.3
+"""The same for the cosines of normals and lines."""
+
 
 def compatibility(
     source: Float[Array, "c 3"],
@@ -19,8 +24,8 @@ def compatibility(
     reference_normals: Float[Array, "c 3"],
     mask: Bool[Array, "c"],
     *,
-    tolerance: float,
-    normal_tolerance: float,
+    tolerance: float = DISTANCE_TOLERANCE,
+    cosine_tolerance: float = COSINE_TOLERANCE,
 ) -> Float[Array, "c c"]:
     """Soft agreement of every two candidates, in [0, 1]; 0 on the diagonal and for padding.
 
@@ -31,7 +36,7 @@ def compatibility(
     others = _invariants(reference, reference_normals, tolerance)
     agrees = _agreement(invariants[0] - others[0], tolerance)
     for one, other in zip(invariants[1:], others[1:], strict=True):
-        agrees = agrees * _agreement(one - other, normal_tolerance)
+        agrees = agrees * _agreement(one - other, cosine_tolerance)
     different = ~jnp.eye(source.shape[0], dtype=bool)
     return jnp.where(different & mask[:, None] & mask[None, :], agrees, 0)
 
@@ -51,7 +56,8 @@ def spectral_weights(first: Float[Array, "*s c c"], *, steps: int = 10) -> Float
     """
     weights = jnp.ones(first.shape[:-1], first.dtype)
     for _ in range(steps):
-        weights = jnp.matmul(first, weights[..., None])[..., 0] + 1e-6
+        product = jnp.matmul(first, weights[..., None], precision=Precision.HIGHEST)
+        weights = product[..., 0] + 1e-6
         weights = weights / safe_norm(weights)[..., None]
     return weights
 

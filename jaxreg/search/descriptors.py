@@ -4,34 +4,49 @@ Everything is a Gaussian-weighted mean over the whole cloud, so that one product
 (n, n) with a table (n, 21) gives every point's statistics: no neighbour lists, no histograms.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import eigen3x3
-from jaxreg.geometry.neighbors import squared_distances, without_padding
 from jaxreg.geometry.numerics import safe_norm, safe_sqrt
 
+NORMAL_RADIUS = 0.15
+"""Radius of the neighbourhood of a normal, in units of the search."""
+OPENNESS_RADIUS = 0.3
+"""Radius at which a surface is seen to be open, in units of the search."""
+INVARIANTS = 16
+"""Features of a point at each radius."""
 _SMALLEST_NORM = 1e-9
 
 
-class Descriptors(NamedTuple):
-    """Features of every point, invariant to rigid motion, and unit normals of arbitrary sign."""
-
-    features: Float[Array, "n d"]
-    normals: Float[Array, "n 3"]
-
-
-def moment_descriptors(
+def gaussian_normals(
     points: Float[Array, "n 3"],
-    mask: Bool[Array, "n"] | None = None,
+    squared: Float[Array, "n n"],
+    mask: Bool[Array, "n"],
+    *,
+    radius: float = NORMAL_RADIUS,
+) -> Float[Array, "n 3"]:
+    """Unit normals of arbitrary sign, zero for padding.
+
+    The direction of the smallest variance of the points around each, weighted by
+    ``exp(-|p_j - p|^2 / (2 (radius/2)^2))``; `squared` are the squared distances within the cloud.
+    """
+    table = jnp.concatenate([points, _outer(points)], axis=1)
+    means = _means(squared, table, mask, radius)
+    spread = means[:, 3:].reshape(-1, 3, 3) - means[:, :3, None] * means[:, None, :3]
+    return jnp.where(mask[:, None], eigen3x3.eigh(spread).vectors[:, :, 0], 0)
+
+
+def moments(
+    points: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    squared: Float[Array, "n n"],
+    mask: Bool[Array, "n"],
     *,
     radii: tuple[float, ...],
-    normal_radius: float,
-) -> Descriptors:
+) -> Float[Array, "n d"]:
     """Sixteen invariants of every point at each of `radii` (unit of the cloud).
 
     With weights ``exp(-|p_j - p|^2 / (2 (r/2)^2))`` let ``o`` be the offset from the point p to the
@@ -41,22 +56,15 @@ def moment_descriptors(
     to the point's own normal n: ``|o . n| / r``, ``|o - n (o . n)| / r``, ``sqrt(n^T C n) / r``,
     ``sqrt(n^T N n)`` (normals have no sign, so each enters squared).
 
-    A constant of every derivative: which points match is a discrete choice.
+    The points should lie around the origin, since C is a difference of means of squares.
     """
-    points = jax.lax.stop_gradient(without_padding(points, mask))
-    valid = jnp.ones(points.shape[0], bool) if mask is None else mask
-    count = jnp.maximum(jnp.sum(valid), 1).astype(points.dtype)
-    centroid = jnp.sum(points, axis=0) / count
-    points = without_padding(points - centroid[None, :], valid)
-    squared = squared_distances(points, points)
-    normals = _normals(points, squared, valid, normal_radius)
     table = jnp.concatenate([points, _outer(points), _outer(normals)], axis=1)
     # One scale after the other: a third quicker than all at once, whose weights (n, n) leave the cache.
     blocks = jax.lax.map(
-        lambda radius: _at_scale(points, normals, squared, table, valid, radius),
+        lambda radius: _at_scale(points, normals, squared, table, mask, radius),
         jnp.asarray(radii, points.dtype),
     )
-    return Descriptors(jnp.concatenate(list(blocks), axis=1), normals)
+    return jnp.concatenate(list(blocks), axis=1)
 
 
 def standardized(
@@ -84,20 +92,29 @@ def standardized(
 def openness(
     points: Float[Array, "n 3"],
     normals: Float[Array, "n 3"],
+    squared: Float[Array, "n n"],
     mask: Bool[Array, "n"],
     *,
-    radius: float,
+    radius: float = OPENNESS_RADIUS,
 ) -> Float[Array, "n"]:
     """How one-sided the surface around a point is: 0 inside it, about 0.4 on a straight edge.
 
     The length, over `radius`, of the tangential part of the offset to the weighted centroid. The
-    rim of a scan is open; so is the end of a thin part.
+    boundary of a scan is open; so is the end of a thin part.
     """
-    points = jnp.where(mask[:, None], points, 0)
-    mean = _means(squared_distances(points, points), points, mask, radius)
+    mean = _means(squared, points, mask, radius)
     offset = mean - points
     along = jnp.sum(offset * normals, axis=1, keepdims=True)
     return safe_norm(offset - along * normals) / radius
+
+
+def mean_spacing(squared: Float[Array, "n n"], mask: Bool[Array, "n"]) -> Float[Array, ""]:
+    """Mean distance from a point to the nearest other one; 0 where there are no two points."""
+    other = mask[None, :] & ~jnp.eye(len(mask), dtype=bool)
+    nearest = jnp.min(jnp.where(other, squared, jnp.inf), axis=1)
+    count = jnp.sum(mask)
+    total = jnp.sum(jnp.where(mask & (count > 1), safe_sqrt(nearest), 0))
+    return total / jnp.maximum(count, 1).astype(total.dtype)
 
 
 def _at_scale(
@@ -126,13 +143,6 @@ def _at_scale(
         ],
         axis=1,
     )
-
-
-def _normals(points: Array, squared: Array, valid: Array, radius: Array | float) -> Array:
-    table = jnp.concatenate([points, _outer(points)], axis=1)
-    means = _means(squared, table, valid, radius)
-    spread = means[:, 3:].reshape(-1, 3, 3) - means[:, :3, None] * means[:, None, :3]
-    return jnp.where(valid[:, None], eigen3x3.eigh(spread).vectors[:, :, 0], 0)
 
 
 def _means(squared: Array, table: Array, valid: Array, radius: Array | float) -> Array:

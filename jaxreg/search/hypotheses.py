@@ -1,9 +1,12 @@
 """A pose from each of the clearest candidates, a quick score of each, and the distinct best."""
 
+import math
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax.lax import Precision
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry.neighbors import squared_distances
 from jaxreg.geometry.procrustes import weighted_procrustes
@@ -12,6 +15,22 @@ from jaxreg.search.nearest import NearestGrid, lookup
 from jaxreg.search.surface import Surface
 from jaxreg.types import RigidTransform
 
+CONSENSUS_SIZE = 12
+"""Other candidates that a pose is computed from."""
+SCREEN_WIDTH = 0.06
+"""Width of the Gaussian overlap that poses are screened by, in units of the search."""
+
+
+class Separation(NamedTuple):
+    """When two poses differ.
+
+    They turn by more than `angle` (radians) from each other, or take the origin to places more than
+    `distance` apart (units of the search).
+    """
+
+    angle: float
+    distance: float
+
 
 def pose_hypotheses(
     source: Float[Array, "c 3"],
@@ -19,16 +38,17 @@ def pose_hypotheses(
     first: Float[Array, "c c"],
     *,
     seeds: int,
-    partners: int,
+    consensus_size: int = CONSENSUS_SIZE,
 ) -> RigidTransform:
-    """One pose (leading axis s) from each of the first `seeds` candidates and its best `partners`.
+    """One pose (leading axis s) from each of the first `seeds` candidates.
 
-    Partners are ranked by second-order compatibility; the weights of the Procrustes solution are
-    the leading eigenvector of the compatibility among them. The seeds are the clearest candidates,
-    not those that agree with most others: where nine of ten are wrong, that loses the right ones.
+    It is that of the candidate and of the `consensus_size` others that agree with it best, ranked by
+    second-order compatibility; the weights of the Procrustes solution are the leading eigenvector of
+    the compatibility among them. The seeds are the clearest candidates, not those that agree with
+    most others: where nine of ten are wrong, that loses the right ones.
     """
     among = second_order(first, seeds)
-    _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, partners))
+    _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, consensus_size))
     own = jnp.arange(seeds, dtype=members.dtype)[:, None]
     members = jnp.concatenate([own, members], axis=1)
     local = first[members[:, :, None], members[:, None, :]]
@@ -37,7 +57,12 @@ def pose_hypotheses(
 
 
 def screen(
-    poses: RigidTransform, source: Surface, reference: Surface, grid: NearestGrid, *, width: float
+    poses: RigidTransform,
+    source: Surface,
+    reference: Surface,
+    grid: NearestGrid,
+    *,
+    width: float = SCREEN_WIDTH,
 ) -> Float[Array, "s"]:
     """Share of the source that a pose lays on the reference, in [0, 1]: cheap, and one way.
 
@@ -54,23 +79,33 @@ def screen(
 
 
 def pick_distinct(
-    poses: RigidTransform, score: Float[Array, "s"], *, count: int, angle: float, distance: float
+    poses: RigidTransform,
+    score: Float[Array, "s"],
+    allowed: Bool[Array, "s"] | None = None,
+    *,
+    count: int,
+    apart: Separation,
 ) -> Int[Array, "count"]:
     """The best pose, the best of those that differ from it, and so on.
 
-    Two poses are the same when they turn by less than `angle` (radians) from each other and take
-    the origin, which should be the centroid of the source, to places less than `distance` apart.
+    The origin should be the centroid of the source. When no pose is left that differs from all those
+    chosen, a second round begins; poses that are not `allowed` take part from the second round on.
     """
     flat = poses.rotation.reshape(-1, 9)
     cosine = (jnp.matmul(flat, flat.T, precision=Precision.HIGHEST) - 1) / 2
-    apart = squared_distances(poses.translation, poses.translation)
-    same = (cosine > jnp.cos(angle)) & (apart < distance**2)
+    gap = squared_distances(poses.translation, poses.translation)
+    same = (cosine > math.cos(apart.angle)) & (gap < apart.distance**2)
+    # A pose must drop out of its round, however far its rotation is from an orthogonal one.
+    same = same | jnp.eye(len(score), dtype=bool)
+    rounds = jnp.zeros(len(score), jnp.int32)
+    if allowed is not None:
+        rounds = jnp.where(allowed, rounds, 1)
 
-    def step(score: Array, _: None) -> tuple[Array, Array]:
-        best = jnp.argmax(score)
-        return jnp.where(same[best], score - 10, score), best
+    def step(rounds: Array, _: None) -> tuple[Array, Array]:
+        best = jnp.argmax(jnp.where(rounds == jnp.min(rounds), score, -jnp.inf))
+        return rounds + same[best].astype(rounds.dtype), best
 
-    return jax.lax.scan(step, score, None, length=count)[1].astype(jnp.int32)
+    return jax.lax.scan(step, rounds, None, length=count)[1].astype(jnp.int32)
 
 
 def best_of(poses: RigidTransform, index: Int[Array, "..."]) -> RigidTransform:

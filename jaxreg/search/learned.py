@@ -10,6 +10,7 @@ from importlib import resources
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg.geometry.neighbors import knn, without_padding
@@ -85,7 +86,8 @@ def learned_features(
 
 def _layer(network: Network, name: str, x: Float[Array, "*n i"]) -> Float[Array, "*n o"]:
     bias = jnp.asarray(network[f"{name}_bias"], x.dtype)
-    product = jnp.matmul(x, jnp.asarray(network[name], x.dtype))
+    weights = jnp.asarray(network[name], x.dtype)
+    product = jnp.matmul(x, weights, precision=Precision.HIGHEST)
     return product + jnp.expand_dims(bias, range(product.ndim - 1))
 
 

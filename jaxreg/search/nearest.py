@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._xla import written_out
 from jaxreg.geometry.neighbors import squared_distances
 
+CELLS = 24
+"""Cells of a grid along each axis: a cell of a usual shape is about a tenth of its radius."""
 _FAR = 1e4
 """Where padding is put, in units of the clouds."""
 
@@ -51,7 +53,7 @@ def _row_of_minimum(squared: Float[Array, "m q"]) -> Int[Array, "q"]:
 
 
 def nearest_grid(
-    points: Float[Array, "m 3"], mask: Bool[Array, "m"], *, cells: int, margin: float
+    points: Float[Array, "m 3"], mask: Bool[Array, "m"], *, cells: int = CELLS, margin: float
 ) -> NearestGrid:
     """`cells` cells along each axis of the bounding box, widened by `margin` on every side."""
     low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0) - margin

@@ -1,6 +1,8 @@
-"""The dense path from two clouds to a pose; jit, vmap and grad it."""
+"""Registration without a start, from two clouds to a pose: describe, match, hypothesise, align, rank.
 
-import functools
+Pure functions of one pair: compose them with `jax.jit`, `jax.vmap` and `jax.grad`.
+"""
+
 import math
 from typing import NamedTuple
 
@@ -9,34 +11,65 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import frame, rigid
-from jaxreg.geometry.neighbors import squared_distances
-from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.refine.gicp import gicp
-from jaxreg.search.alignment import align_coarse, align_fine
+from jaxreg.search.alignment import FINE_EPSILON, align_coarse, align_fine
 from jaxreg.search.candidates import select_candidates
 from jaxreg.search.compatibility import compatibility
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.descriptors import Descriptors, moment_descriptors, openness, standardized
-from jaxreg.search.hypotheses import best_of, pick_distinct, pose_hypotheses, screen
-from jaxreg.search.learned import Network, learned_features
-from jaxreg.search.nearest import NearestGrid, nearest_grid, nearest_packed
-from jaxreg.search.ranking import Evidence, evidence, evidence_by_grid, plausibility, settle
+from jaxreg.search.description import Compared, Described, compare, describe
+from jaxreg.search.hypotheses import (
+    CONSENSUS_SIZE,
+    Separation,
+    best_of,
+    pick_distinct,
+    pose_hypotheses,
+    screen,
+)
+from jaxreg.search.learned import Network
+from jaxreg.search.nearest import NearestGrid, nearest_packed
+from jaxreg.search.ranking import (
+    NEAR_WIDTH,
+    break_ties,
+    score_of,
+    score_terms,
+    score_terms_by_grid,
+    sparsity_factor,
+)
 from jaxreg.search.surface import Surface, thinned
 from jaxreg.types import Registration, RigidTransform
 
 _DEFAULT = SearchConfig()
 _RMS_OF_UNIT_SPHERE = 0.5
 """Root mean square radius of a usual shape that touches the unit sphere (ModelNet40: 0.4 to 0.6)."""
+_COARSE_STEP = 2
+"""Screening and alignment inside the search take every second point: ranking sees all of them."""
+_SCREENED_APART = Separation(angle=0.26, distance=0.15)
+"""Poses nearer than this are drawn to one pose by the coarse alignment."""
+_ALIGNED_APART = Separation(angle=0.1, distance=0.05)
+"""Poses nearer than this are drawn to one pose by the fine alignment."""
+_FINAL_REACH = 0.06
+"""Largest distance of the pairs of the last refinement, in units of the search, for dense clouds."""
 
 
 class Search(NamedTuple):
-    """The aligned poses (leading axis), best first, in the original frame, and their plausibility.
+    """The aligned poses (leading axis), the best first, with their scores (`ranking`).
 
-    In close calls it is that of `verification.settle`.
+    Poses that turn by more than the search may are not `allowed`, and come last.
     """
 
     poses: RigidTransform
     score: Float[Array, "s"]
+    allowed: Bool[Array, "s"]
+
+
+class _Problem(NamedTuple):
+    """Two clouds that are to be laid on each other, and what all stages need to know of them."""
+
+    source: Surface
+    reference: Surface
+    grids: tuple[NearestGrid, NearestGrid]
+    sparsity: Float[Array, ""]
+    max_angle: Float[Array, ""] | float
 
 
 def register_global(
@@ -56,32 +89,36 @@ def register_global(
     cosines in [-1, 1] of any features.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
-    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `config.match_width`. The pose
-    is differentiable in both clouds through the last refinement alone: the search is discrete.
+    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `ranking.NEAR_WIDTH` units of
+    the search. The pose is differentiable in both clouds through the last refinement alone: the
+    search is discrete.
 
     Raises:
-      ValueError: a cloud is not (n, 3), or has fewer points than `config.matches` + 1.
+      ValueError: a cloud is not (n, 3) or has fewer than four rows.
     """
-    where, x, y = enter(source, reference, source_mask, reference_mask, config)
-    found = _search(x, y, source_mask, reference_mask, network, similarity, config)
+    where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
+    described = [
+        describe(p, m, unit=1.0, config=config) for p, m in ((x, source_mask), (y, reference_mask))
+    ]
+    found = search_described(*described, network=network, similarity=similarity, config=config)
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
-    widening = _widening(x, y, source_mask, reference_mask, config)
+    sparsity = sparsity_factor(*(cloud.spacing for cloud in described))
     pose = gicp(
         x,
         y,
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
-        iterations=config.final_iterations,
-        max_distance=config.final_reach * jax.lax.stop_gradient(widening),
-        anneal=config.final_anneal,
+        iterations=15,
+        max_distance=_FINAL_REACH * sparsity,
+        anneal=8.0,
         both_directions=True,
-        neighbors=min(config.final_neighbors, min(len(x), len(y)) - 1),
-        thickness=config.thickness,
-        partners=config.final_partners,
+        neighbors=min(16, min(len(x), len(y)) - 1),
+        thickness=FINE_EPSILON,
+        partners=2,
         edges=True,
     )
-    return _registration(where, pose, x, y, source_mask, reference_mask, config)
+    return _registration(where, pose, x, y, *(cloud.mask for cloud in described))
 
 
 def search_poses(
@@ -93,113 +130,81 @@ def search_poses(
     network: Network | None = None,
     similarity: Float[Array, "n m"] | None = None,
     also: RigidTransform | None = None,
-    largest_angle: Float[Array, ""] | float = math.pi,
+    max_angle: Float[Array, ""] | float = math.pi,
     config: SearchConfig = _DEFAULT,
 ) -> Search:
     """The poses of the search before the last refinement; arguments and errors as `register_global`.
 
-    `also` is a pose that is tried beside those found. Poses that turn by more than `largest_angle`
-    (radians) come last, with a score 10 lower.
+    `also` is a pose that is tried beside those found. Poses that turn by more than `max_angle`
+    (radians) are not allowed.
     """
-    where, x, y = enter(source, reference, source_mask, reference_mask, config)
+    where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     also = None if also is None else frame.transform_in(where, also)
-    found = _search(
-        x, y, source_mask, reference_mask, network, similarity, config, also, largest_angle
+    found = search_described(
+        describe(x, source_mask, unit=1.0, config=config),
+        describe(y, reference_mask, unit=1.0, config=config),
+        network=network,
+        similarity=similarity,
+        also=also,
+        max_angle=max_angle,
+        config=config,
     )
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
 
 
-def enter(source, reference, source_mask, reference_mask, config: SearchConfig):
-    """Both clouds centred, in units of which a usual shape fills the unit sphere."""
-    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
-    factor = _RMS_OF_UNIT_SPHERE if config.unit == 0 else where.length / config.unit
-    where = where._replace(length=where.length / factor)
-    return where, x * factor, y * factor
-
-
-def surfaces(x, y, source_mask, reference_mask, config: SearchConfig, network=None):
-    """Both clouds with normals, rims and local features, and the cosines of all their features.
-
-    These are the moments, or what `network` makes of them.
-    """
-    masks = [
-        jnp.ones(points.shape[0], bool) if mask is None else mask
-        for points, mask in ((x, source_mask), (y, reference_mask))
-    ]
-    described, rims = zip(
-        *(_described(points, mask, config) for points, mask in zip((x, y), masks, strict=True)),
-        strict=True,
-    )
-    features = [cloud.features for cloud in described]
-    local = standardized(*(f[:, : f.shape[1] // len(config.radii)] for f in features), *masks)
-    source, reference = (
-        Surface(points, cloud.normals, rim, nearby, mask)
-        for points, cloud, rim, nearby, mask in zip(
-            (x, y), described, rims, local, masks, strict=True
-        )
-    )
-    one, other = standardized(*features, *masks)
-    if network is not None:
-        one, other = (
-            learned_features(network, moments, s.openness, s.points, s.normals, s.mask)
-            for moments, s in ((one, source), (other, reference))
-        )
-    return source, reference, jnp.matmul(one, other.T)
-
-
-@functools.partial(jax.jit, static_argnames="config")  # Traced once for two clouds of one size.
-def _described(points: Array, mask: Array, config: SearchConfig) -> tuple[Descriptors, Array]:
-    """Descriptors of a cloud, and how open it is around every point."""
-    cloud = moment_descriptors(points, mask, radii=config.radii, normal_radius=config.normal_radius)
-    return cloud, openness(points, cloud.normals, mask, radius=config.rim_radius)
-
-
-def _search(
-    x,
-    y,
-    source_mask,
-    reference_mask,
-    network,
-    similarity,
-    config: SearchConfig,
-    also=None,
-    largest_angle=math.pi,
+def search_described(
+    source: Described,
+    reference: Described,
+    *,
+    network: Network | None = None,
+    similarity: Float[Array, "n m"] | None = None,
+    also: RigidTransform | None = None,
+    max_angle: Float[Array, ""] | float = math.pi,
+    config: SearchConfig = _DEFAULT,
 ) -> Search:
-    x, y, similarity = jax.lax.stop_gradient((x, y, similarity))
-    source, reference, found = surfaces(x, y, source_mask, reference_mask, config, network)
-    poses = _hypotheses(source, reference, found if similarity is None else similarity, config)
-    grids = [
-        nearest_grid(s.points, s.mask, cells=config.grid_cells, margin=config.screen_width)
-        for s in (reference, source)
-    ]
-    poses = _screened(poses, also, source, reference, grids, largest_angle, config)
-    few, fewer = (thinned(s, config.coarse_step) for s in (source, reference))
-    coarse = lambda pose: align_coarse(  # noqa: E731
-        pose,
-        few,
-        reference,
-        grids[0],
-        config.coarse_widths,
-        thickness=config.coarse_thickness,
+    """`search_poses` of clouds that were described before, both in one unit.
+
+    The poses map the points of `source` to those of `reference` as they stand in these records: about
+    their own origins, in units of the search. So does `also`.
+
+    Raises:
+      ValueError: as `search_poses`.
+    """
+    compared = compare(source, reference, network=network)
+    if similarity is not None:
+        compared = compared._replace(similarity=similarity)
+    problem = _Problem(
+        compared.source,
+        compared.reference,
+        (source.grid, reference.grid),
+        sparsity_factor(source.spacing, reference.spacing),
+        max_angle,
     )
-    fine = lambda pose: align_fine(  # noqa: E731
-        pose, few, fewer, config.fine_widths, thickness=config.thickness
-    )
-    widening = _widening(x, y, source_mask, reference_mask, config)
-    poses = jax.vmap(coarse)(poses)
-    poses = _shortlist(poses, source, reference, grids, widening, largest_angle, config)
-    poses = jax.lax.map(fine, poses)
-    return _ranked(poses, source, reference, widening, largest_angle, config)
+    poses = _screened(_hypotheses(compared, config), also, problem, config)
+    poses = _shortlisted(_coarsely_aligned(poses, problem), problem, config)
+    return _ranked(_finely_aligned(poses, problem), problem)
 
 
-def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: SearchConfig):
-    candidates = select_candidates(
-        similarity,
-        source.mask,
-        reference.mask,
-        matches=config.matches,
-        keep=config.candidates,
-    )
+def enter(
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+    *,
+    unit: float | None = None,
+) -> tuple[frame.Frame, Float[Array, "n 3"], Float[Array, "m 3"]]:
+    """Both clouds about their centroids in units of the search, and the frame that leads back.
+
+    `unit` is `SearchConfig.unit`. Errors as `register_global`.
+    """
+    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
+    factor = _RMS_OF_UNIT_SPHERE if unit is None else where.length / unit
+    return where._replace(length=where.length / factor), x * factor, y * factor
+
+
+def _hypotheses(compared: Compared, config: SearchConfig) -> RigidTransform:
+    source, reference, similarity = jax.lax.stop_gradient(compared)
+    candidates = select_candidates(similarity, source.mask, reference.mask, keep=config.candidates)
     i, j = candidates.source_index, candidates.reference_index
     first = compatibility(
         source.points[i],
@@ -207,50 +212,71 @@ def _hypotheses(source: Surface, reference: Surface, similarity: Array, config: 
         source.normals[i],
         reference.normals[j],
         candidates.mask,
-        tolerance=config.tolerance,
-        normal_tolerance=config.normal_tolerance,
     )
     return pose_hypotheses(
         source.points[i],
         reference.points[j],
         first,
         seeds=min(config.seeds, len(i)),
-        partners=min(config.partners, len(i) - 1),
+        consensus_size=min(CONSENSUS_SIZE, len(i) - 1),
     )
 
 
 def _screened(
-    poses,
-    also,
-    source: Surface,
-    reference: Surface,
-    grids: list[NearestGrid],
-    largest_angle,
-    config: SearchConfig,
-):
+    poses: RigidTransform, also: RigidTransform | None, problem: _Problem, config: SearchConfig
+) -> RigidTransform:
     """The distinct best hypotheses by their overlap in both directions, `also` the first of them."""
     if also is not None:
         poses = jax.tree.map(lambda one, all: jnp.concatenate([one[None], all]), also, poses)
-    a, b = thinned(source, config.coarse_step), thinned(reference, config.coarse_step)
-    backward = jax.vmap(rigid.inverse)(poses)
-    score = screen(poses, a, reference, grids[0], width=config.screen_width)
-    score = score + screen(backward, b, source, grids[1], width=config.screen_width)
-    score = _bounded(score, poses, largest_angle)
+    source, reference, grids, _, max_angle = problem
+    score = screen(poses, thinned(source, _COARSE_STEP), reference, grids[1])
+    back = jax.vmap(rigid.inverse)(poses)
+    score = score + screen(back, thinned(reference, _COARSE_STEP), source, grids[0])
+    allowed = _turns_less(poses, max_angle)
     if also is not None:
-        score = score.at[0].set(5)
-    return _distinct_best(
-        poses, score, config.screened, config.distinct_angle, config.distinct_distance
+        score, allowed = score.at[0].set(jnp.inf), allowed.at[0].set(True)
+    count = min(config.screened, len(score))
+    chosen = pick_distinct(poses, score, allowed, count=count, apart=_SCREENED_APART)
+    return best_of(poses, chosen)
+
+
+def _coarsely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
+    few = thinned(problem.source, _COARSE_STEP)
+    return jax.vmap(lambda pose: align_coarse(pose, few, problem.reference, problem.grids[1]))(
+        poses
     )
 
 
-def _distinct_best(poses, score: Array, most: int, angle: float, distance: float) -> RigidTransform:
-    count = min(most, len(score))
-    return best_of(poses, pick_distinct(poses, score, count=count, angle=angle, distance=distance))
+def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> RigidTransform:
+    """The distinct poses that score best at a glance: the fine alignment is what takes time."""
+    source, reference, grids, sparsity, max_angle = problem
+
+    def at_a_glance(pose: RigidTransform):
+        return score_of(
+            score_terms_by_grid(
+                pose, source, reference, grids, step=_COARSE_STEP, sparsity=sparsity
+            )
+        )
+
+    score, allowed = jax.vmap(at_a_glance)(poses), _turns_less(poses, max_angle)
+    count = min(config.aligned, len(score))
+    return best_of(poses, pick_distinct(poses, score, allowed, count=count, apart=_ALIGNED_APART))
 
 
-def _bounded(score: Array, poses: RigidTransform, largest_angle) -> Float[Array, "s"]:
-    """The scores (within a few units of 0), those of poses that turn too far below all others."""
-    return jnp.where(_turns_less(poses, largest_angle), score, score - 10)
+def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
+    few, fewer = (thinned(s, _COARSE_STEP) for s in (problem.source, problem.reference))
+    return jax.lax.map(lambda pose: align_fine(pose, few, fewer), poses)
+
+
+def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
+    """The poses, the allowed ones first, then by their score, with ties broken."""
+    source, reference, _, sparsity, max_angle = problem
+    terms = jax.lax.map(lambda pose: score_terms(pose, source, reference, sparsity=sparsity), poses)
+    # Again, since alignment may have turned a pose out of the bounds of the search.
+    allowed = _turns_less(poses, max_angle)
+    score = break_ties(score_of(terms), terms.plane, allowed)
+    order = jnp.lexsort((-score, ~allowed))
+    return Search(best_of(poses, order), score[order], allowed[order])
 
 
 def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:
@@ -258,98 +284,13 @@ def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]
     return trace >= 1 + 2 * jnp.cos(jnp.minimum(angle, math.pi)) - 1e-5
 
 
-def _shortlist(
-    poses,
-    source: Surface,
-    reference: Surface,
-    grids: list[NearestGrid],
-    widening: Array,
-    largest_angle,
-    config: SearchConfig,
-) -> RigidTransform:
-    """The distinct poses that are plausible at a glance: the last alignment is what takes time."""
-    found = jax.vmap(
-        lambda pose: evidence_by_grid(
-            pose,
-            source,
-            reference,
-            grids[1],
-            grids[0],
-            step=config.coarse_step,
-            width=config.match_width * widening,
-            plane_width=config.plane_width * widening,
-            rim=config.rim,
-        )
-    )(poses)
-    return _distinct_best(
-        poses,
-        _bounded(_score(found, config), poses, largest_angle),
-        config.aligned,
-        config.aligned_angle,
-        config.aligned_distance,
-    )
-
-
-def _ranked(
-    poses,
-    source: Surface,
-    reference: Surface,
-    widening: Array,
-    largest_angle,
-    config: SearchConfig,
-) -> Search:
-    """The poses, the most plausible first, and their plausibility, settled in close calls."""
-    found = jax.lax.map(
-        lambda pose: evidence(
-            pose,
-            source,
-            reference,
-            width=config.match_width * widening,
-            plane_width=config.plane_width * widening,
-            rim=config.rim,
-        ),
-        poses,
-    )
-    # Again, since alignment may have turned a pose out of the bounds of the search.
-    score = _bounded(_score(found, config), poses, largest_angle)
-    score = settle(score, found.flush, doubt=config.doubt, worth=config.flush)
-    score, order = jax.lax.top_k(score, len(score))
-    return Search(best_of(poses, order), score)
-
-
-def _score(found: Evidence, config: SearchConfig) -> Float[Array, "s"]:
-    return plausibility(found, alike=config.alike, within=config.within, beside=config.beside)
-
-
-def _widening(x, y, source_mask, reference_mask, config: SearchConfig) -> Float[Array, ""]:
-    """How much farther apart than in dense clouds the points of matching surfaces lie."""
-    sparse = jnp.maximum(_spacing(x, source_mask), _spacing(y, reference_mask))
-    return jnp.maximum(sparse / config.dense_spacing, 1)
-
-
-def _spacing(points: Array, mask: Array | None) -> Float[Array, ""]:
-    """Mean distance from a point to the nearest other one."""
-    mask = jnp.ones(len(points), bool) if mask is None else mask
-    squared = squared_distances(points, points)
-    other = mask[None, :] & ~jnp.eye(len(mask), dtype=bool)
-    nearest = safe_sqrt(jnp.min(jnp.where(other, squared, 4), axis=1))
-    count = jnp.maximum(jnp.sum(mask), 1).astype(squared.dtype)
-    return jnp.sum(jnp.where(mask, nearest, 0)) / count
-
-
-def _registration(
-    where, pose, x, y, source_mask, reference_mask, config: SearchConfig
-) -> Registration:
-    source_mask, reference_mask = (
-        jnp.ones(points.shape[0], bool) if mask is None else mask
-        for points, mask in ((x, source_mask), (y, reference_mask))
-    )
+def _registration(where, pose, x, y, source_mask, reference_mask) -> Registration:
     valid = jnp.any(source_mask) & jnp.any(reference_mask)
     pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
     moved = rigid.apply(pose, x)
     nearest = nearest_packed(moved, y, reference_mask)
     squared = jnp.sum((moved - y[nearest]) ** 2, axis=-1)
-    trust = jnp.exp(-squared / (2 * config.match_width**2))
+    trust = jnp.exp(-squared / (2 * NEAR_WIDTH**2))
     trust = jnp.where(source_mask & valid, trust, 0)
     pose = frame.transform_out(where, pose)
     correspondences = y[nearest] * where.length + where.reference_centre[None, :]

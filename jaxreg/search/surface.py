@@ -1,4 +1,4 @@
-"""A cloud as this room uses it: points, normals, how open the surface is there, and the mask."""
+"""A cloud as the stages of the search see it, with what it looks like around every point."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 class Surface(NamedTuple):
     """Points of a surface with unit normals of arbitrary sign; rows with `mask` False are padding.
 
-    `openness` is near 0 inside the sampled surface and large on its rim. `local` are features of
+    `openness` is near 0 inside the sampled surface and large at its boundary. `local` are features of
     length 1 that say what the surface looks like nearby.
     """
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.search.config import SearchConfig
-from jaxreg.search.pipeline import surfaces
+from jaxreg.search.description import compare, describe
 from research import learned_ranking as ranking
 
 pytestmark = pytest.mark.loose
@@ -14,7 +13,8 @@ pytestmark = pytest.mark.loose
 
 def test_facts_of_a_cloud_on_itself(seed):
     points = jnp.asarray(np.random.default_rng(seed).normal(size=(40, 3)))
-    surface, other, _ = jax.jit(lambda x: surfaces(x, x, None, None, SearchConfig()))(points)
+    described = jax.jit(lambda x: describe(x, unit=1.0))(points)
+    surface, other, _ = compare(described, described)
     facts = np.asarray(ranking.facts(surface, other))
     assert facts.shape == (40, 17)
     np.testing.assert_allclose(facts[:, :10], 1, atol=1e-6)  # near, on the plane, facing, alike

@@ -40,8 +40,8 @@ def pair(seed, n=300, m=400):
 def test_both_find_the_motion_of_another_sampling(seed):
     source, reference, turn, start = pair(seed)
     grid = nearest_grid(reference.points, reference.mask, cells=24, margin=0.1)
-    coarse = align_coarse(start, source, reference, grid, WIDTHS, thickness=0.1)
-    fine = align_fine(coarse, source, reference, WIDTHS, thickness=0.01)
+    coarse = align_coarse(start, source, reference, grid, widths=WIDTHS, epsilon=0.1)
+    fine = align_fine(coarse, source, reference, widths=WIDTHS, epsilon=0.01)
     for pose, angle, length in ((coarse, 3, 0.05), (fine, 0.5, 0.01)):
         error = (Rotation.from_matrix(np.asarray(pose.rotation)) * turn.inv()).magnitude()
         assert np.degrees(error) < angle
@@ -57,11 +57,11 @@ def test_padding_changes_nothing_and_no_pair_keeps_the_pose(seed):
         jnp.zeros((len(s.mask) + 9, 1)),
         jnp.arange(len(s.mask) + 9) < len(s.mask),
     )
-    alone = align_fine(start, source, reference, WIDTHS, thickness=0.01)
-    found = align_fine(start, pad(source), pad(reference), WIDTHS, thickness=0.01)
+    alone = align_fine(start, source, reference, widths=WIDTHS, epsilon=0.01)
+    found = align_fine(start, pad(source), pad(reference), widths=WIDTHS, epsilon=0.01)
     np.testing.assert_allclose(found.rotation, alone.rotation, atol=1e-9)
     empty = source._replace(mask=jnp.zeros(60, bool))
-    kept = align_fine(start, empty, reference, WIDTHS, thickness=0.01)
+    kept = align_fine(start, empty, reference, widths=WIDTHS, epsilon=0.01)
     np.testing.assert_allclose(kept.rotation, start.rotation, atol=1e-12)
 
 
@@ -71,7 +71,7 @@ def test_derivative_of_the_fine_alignment(seed):
     @jax.jit
     def total(points, others):
         a, b = source._replace(points=points), reference._replace(points=others)
-        pose = align_fine(start, a, b, (0.3, 0.2), thickness=0.1)
+        pose = align_fine(start, a, b, widths=(0.3, 0.2), epsilon=0.1)
         return jnp.sum(pose.rotation[0]) + jnp.sum(pose.translation)
 
     check_grads(total, (source.points, reference.points), 1, modes=["rev"], atol=1e-4, rtol=1e-4)

@@ -14,7 +14,7 @@ def test_equals_the_definition_pair_by_pair(seed):
     rng = np.random.default_rng(seed)
     p, q, a, b = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), unit(rng, 9), unit(rng, 9)
     found = compatibility(
-        *map(jnp.asarray, (p, q, a, b)), jnp.arange(9) < 8, tolerance=2.0, normal_tolerance=0.9
+        *map(jnp.asarray, (p, q, a, b)), jnp.arange(9) < 8, tolerance=2.0, cosine_tolerance=0.9
     )
     bell = lambda change, tolerance: max(0, 1 - (change / tolerance) ** 2)  # noqa: E731
     for i in range(9):
@@ -40,7 +40,7 @@ def test_right_candidates_agree_fully_and_outweigh_wrong_ones(seed):
     q, b = p @ turn.T + 1, a @ turn.T * rng.choice([-1, 1], (40, 1))
     q[20:] = rng.normal(size=(20, 3))
     first = compatibility(
-        *map(jnp.asarray, (p, q, a, b)), jnp.ones(40, bool), tolerance=0.1, normal_tolerance=0.3
+        *map(jnp.asarray, (p, q, a, b)), jnp.ones(40, bool), tolerance=0.1, cosine_tolerance=0.3
     )
     np.testing.assert_allclose(first[:20, :20], 1 - np.eye(20), atol=1e-9)
     weights = np.asarray(spectral_weights(first))

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural import shapes
-from jaxreg.search.config import SearchConfig
+from jaxreg.search.description import compare, describe
 from jaxreg.search.learned import init_network, learned_features
-from jaxreg.search.pipeline import surfaces
 
 pytestmark = [pytest.mark.float32]
 N, ROWS = 400, 448
@@ -15,7 +14,8 @@ N, ROWS = 400, 448
 
 @jax.jit
 def cosines(network, x, y, x_mask, y_mask):
-    return surfaces(x, y, x_mask, y_mask, SearchConfig(), network)[2]
+    described = (describe(p, mask, unit=1.0) for p, mask in ((x, x_mask), (y, y_mask)))
+    return compare(*described, network=network).similarity
 
 
 def padded(points, value):

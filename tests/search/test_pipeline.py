@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.search import register_global
 from jaxreg.search.config import SearchConfig
+from jaxreg.search.description import compare, describe
 from jaxreg.search.learned import init_network
-from jaxreg.search.pipeline import enter, search_poses, surfaces
+from jaxreg.search.pipeline import enter, search_poses
 
 pytestmark = [pytest.mark.float32]
-CONFIG = SearchConfig(candidates=256, grid_cells=16, screened=24, aligned=8)
+CONFIG = SearchConfig(candidates=256, screened=24, aligned=8)
 
 
 @jax.jit
@@ -112,8 +113,9 @@ def test_a_network_matches_points_by_its_features(seed):
 
     @jax.jit
     def searches(x, y):
-        _, a, b = enter(x, y, mask, other, CONFIG)
-        cosines = surfaces(a, b, mask, other, CONFIG, network)[2]
+        _, a, b = enter(x, y, mask, other)
+        described = (describe(p, m, unit=1.0) for p, m in ((a, mask), (b, other)))
+        cosines = compare(*described, network=network).similarity
         return [
             search_poses(x, y, **masks, **features, config=CONFIG)
             for features in ({"network": network}, {"similarity": cosines}, {})

@@ -1,0 +1,134 @@
+"""What the search knows of one cloud, made once, and of two clouds before it moves any.
+
+A cloud that is registered with many others is described once: everything here that takes
+time depends on one cloud alone.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Bool, Float
+
+from jaxreg.geometry.neighbors import squared_distances, without_padding
+from jaxreg.search.config import SearchConfig
+from jaxreg.search.descriptors import (
+    INVARIANTS,
+    gaussian_normals,
+    mean_spacing,
+    moments,
+    openness,
+    standardized,
+)
+from jaxreg.search.hypotheses import SCREEN_WIDTH
+from jaxreg.search.learned import Network, learned_features
+from jaxreg.search.nearest import NearestGrid, nearest_grid
+from jaxreg.search.surface import Surface
+
+_DEFAULT = SearchConfig()
+
+
+class Described(NamedTuple):
+    """A cloud in units of the search, and everything of it that no other cloud plays a role in.
+
+    `normals` are of length 1 and arbitrary sign, `openness` says where the surface ends,
+    `features` are the raw `descriptors.moments`, `spacing` is the mean distance to the nearest
+    point. Rows with `mask` False are padding.
+    """
+
+    points: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    openness: Float[Array, "n"]
+    features: Float[Array, "n d"]
+    mask: Bool[Array, "n"]
+    grid: NearestGrid
+    spacing: Float[Array, ""]
+
+
+class Compared(NamedTuple):
+    """Two surfaces whose local features can be compared, and the cosines of all their features."""
+
+    source: Surface
+    reference: Surface
+    similarity: Float[Array, "n m"]
+
+
+def describe(
+    points: Float[Array, "n 3"],
+    mask: Bool[Array, "n"] | None = None,
+    *,
+    unit: Float[Array, ""] | float,
+    normals: Float[Array, "n 3"] | None = None,
+    config: SearchConfig = _DEFAULT,
+) -> Described:
+    """A cloud as `search_described` takes it.
+
+    The points must lie around the origin: subtract their centroid first. Both clouds of a pair need
+    one `unit` (in the unit of the points); twice the root mean square radius is right for most. It
+    may be a traced scalar. `normals` of length 1 are taken in place of computed ones.
+
+    A constant of every derivative: which points match is a discrete choice.
+
+    Raises:
+      ValueError: `points` or `normals` is not (n, 3), or `mask` is not (n,).
+    """
+    check_cloud("points", points, mask)
+    if normals is not None and normals.shape != points.shape:
+        raise ValueError(
+            f"normals must have the shape of the points, {points.shape}, got {normals.shape}: give "
+            "one unit normal for every point."
+        )
+    valid = jnp.ones(points.shape[0], bool) if mask is None else mask
+    points = without_padding(points, valid) / jnp.asarray(unit, points.dtype)
+    points = jax.lax.stop_gradient(points)
+    squared = squared_distances(points, points)
+    if normals is None:
+        normals = gaussian_normals(points, squared, valid)
+    normals = jax.lax.stop_gradient(without_padding(normals, valid))
+    return Described(
+        points,
+        normals,
+        openness(points, normals, squared, valid),
+        moments(points, normals, squared, valid, radii=config.radii),
+        valid,
+        nearest_grid(points, valid, margin=SCREEN_WIDTH),
+        mean_spacing(squared, valid),
+    )
+
+
+def compare(source: Described, reference: Described, *, network: Network | None = None) -> Compared:
+    """Features of both clouds in common units, and their cosines.
+
+    These features are the moments, or what `network` makes of them; the local ones of the surfaces
+    are the moments at the smallest radius.
+    """
+    masks = source.mask, reference.mask
+    local = standardized(
+        source.features[:, :INVARIANTS], reference.features[:, :INVARIANTS], *masks
+    )
+    surfaces = [
+        Surface(cloud.points, cloud.normals, cloud.openness, nearby, cloud.mask)
+        for cloud, nearby in zip((source, reference), local, strict=True)
+    ]
+    one, other = standardized(source.features, reference.features, *masks)
+    if network is not None:
+        one, other = (
+            learned_features(network, moments, s.openness, s.points, s.normals, s.mask)
+            for moments, s in zip((one, other), surfaces, strict=True)
+        )
+    return Compared(*surfaces, jnp.matmul(one, other.T, precision=Precision.HIGHEST))
+
+
+def check_cloud(name: str, points: Array, mask: Array | None) -> None:
+    """Raises ValueError unless `points` is (n, 3) with a row, and `mask` None or (n,)."""
+    if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
+        raise ValueError(
+            f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, and use "
+            "jax.vmap for a batch."
+        )
+    if mask is not None and mask.shape != points.shape[:1]:
+        raise ValueError(
+            f"the mask of {name} must have shape {points.shape[:1]}, got {mask.shape}: give one bool "
+            "for every row, True where it is a point."
+        )
