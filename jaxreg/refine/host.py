@@ -88,7 +88,7 @@ def refine_indexed(
     `distance` is the largest of corresponding points, in the unit of the frame.
     """
     check_config(config)
-    weighting = Weighting(config.kernel, None, np.float32(distance), config.trim)
+    weighting = Weighting(config.kernel, None, float(distance), config.trim)
     pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config)
     # It is orthogonal to float32 only, until here.
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)

@@ -82,13 +82,14 @@ def iterate(
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    The kernel narrows to its final width. Where a step is below `config.tolerance` half of the
-    remaining widths are skipped, and at the final width all are. Large clouds first converge with
-    every k-th point.
+    The kernel narrows to its final width in `config.iterations` steps; where one is below
+    `config.tolerance` half of the remaining widths are skipped. At the final width as many follow,
+    until one is below. Large clouds first converge with every k-th point.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
+    widths = np.concatenate([widths, np.ones_like(widths)])
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
-    levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
+    levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, widths[len(widths) // 2 :])]
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
         i, converged = 0, False
@@ -103,7 +104,7 @@ def iterate(
             still = _change(pose, new) < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
             # From a wider kernel at least to the next one, at most to the last.
-            halfway = min((i + len(widths)) // 2, len(widths) - 1)
+            halfway = min((i + config.iterations) // 2, config.iterations - 1)
             i = max(i + 1, halfway) if still else i + 1
     return pose, taken, converged, pairs
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_pose, padded_size
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
-from jaxreg.refine.host import Refined, in_units, refine_indexed, unrefined
+from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
 from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
@@ -211,7 +211,7 @@ def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
     rival = float(score[best] - score[others].max()) if others.any() else verdict.NO_RIVAL
     alternatives = tuple(
         Alternative(frame.transform_out(where, _nth(poses, i)), float(score[best] - score[i]))
-        for i in np.flatnonzero(others)
+        for i in np.flatnonzero(others).tolist()
     )
     return _Found(_nth(poses, best), rival, alternatives)
 
@@ -283,8 +283,10 @@ def _result(
     confidence = np.maximum(0, 1 - (near / problem.distance) ** 2) ** 2
     correspondences = problem.reference.points[nearest] * problem.reference.radius
     chance = verdict.probability(judged)
-    uncertainty = in_units(refined.uncertainty, where)
-    weak = weak_directions(uncertainty)
+    weak = tuple(
+        direction._replace(point=where.reference_centre + length * direction.point)
+        for direction in weak_directions(refined.uncertainty)
+    )
     return ScanRegistration(
         rotation=pose.rotation,
         translation=pose.translation,
@@ -300,7 +302,7 @@ def _result(
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
         max_correspondence_distance=problem.distance * length,
-        covariance=_covariance(uncertainty, where),
+        covariance=_covariance(refined.uncertainty, length),
         weak_directions=weak,
         alternatives=alternatives,
         evidence=judged,
@@ -317,8 +319,9 @@ def _nearest(problem: _Problem, pose: RigidTransform) -> tuple[np.ndarray, np.nd
     return near * (reference.radius / length), index
 
 
-def _covariance(uncertainty: PoseUncertainty, where: frame.Frame) -> Float[np.ndarray, "6 6"]:
-    """About the centroid of the reference; NaN where unknown."""
+def _covariance(uncertainty: PoseUncertainty, length: float) -> Float[np.ndarray, "6 6"]:
+    """About the centroid of the reference, which is the origin of the frame; NaN where unknown."""
     if not uncertainty.weight > 0:
         return np.full((6, 6), np.nan)
-    return about(uncertainty, where.reference_centre).covariance
+    units = np.repeat([1.0, length], 3)
+    return about(uncertainty, np.zeros(3)).covariance * np.outer(units, units)

@@ -60,7 +60,8 @@ class Level:
     @functools.cached_property
     def own_agreement(self) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
         """What `agreement` says of every point and its nearest neighbour in the same cloud."""
-        nearest = self.index.tree.query(self.points, k=2, workers=-1)[1][:, 1]
+        k = min(2, len(self.points))  # a cloud of one point is its own neighbour
+        nearest = self.index.tree.query(self.points, k=[k], workers=-1)[1][:, 0]
         normals = self.index.host_normals
         return agreement(self.points, self.points[nearest], normals, normals[nearest])
 
@@ -70,7 +71,8 @@ class Level:
         if key not in self._described:
             normals = None if self.normals is None else padded(self.normals, size)[0]
             arrays = padded(self.points, size)
-            self._described[key] = _describe(*arrays, np.float32(unit), normals, config=config)
+            scale = np.float32(np.clip(unit, 1e-30, 1e30))
+            self._described[key] = _describe(*arrays, scale, normals, config=config)
         return self._described[key]
 
 

@@ -54,7 +54,9 @@ def record(result: ScanRegistration) -> dict[str, Any]:
         for field in dataclasses.fields(result)
         if field.name not in _PER_POINT
     }
-    return _plain(values | {"mean_confidence": float(np.mean(result.confidence))})
+    weak = [{"name": found.name} | found._asdict() for found in result.weak_directions]
+    values |= {"weak_directions": weak, "mean_confidence": float(np.mean(result.confidence))}
+    return _plain(values)
 
 
 def _alternatives(result: ScanRegistration) -> str:

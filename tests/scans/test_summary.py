@@ -78,7 +78,8 @@ def test_record_is_json_and_reads_back(result):
         "overlap": 0.6, "smaller": 0.5, "gap": None, "facing": 0.0, "constraint": 0.3, "rival": 0.2,
     }  # fmt: skip
     np.testing.assert_array_equal(read["rotation"], result.rotation)
-    assert read["weak_directions"] == ["one", "another"]
+    assert [found["name"] for found in read["weak_directions"]] == [SLIDE.name, TURN.name]
+    assert read["weak_directions"][1]["axis"] == [0, 0, 1]
     assert read["mean_confidence"] == 0.5
     assert "confidence" not in read
 
