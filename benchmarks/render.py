@@ -10,6 +10,7 @@ below it. `bare_numbers` finds a number that was typed by hand.
 
 import dataclasses
 import difflib
+import functools
 import json
 import re
 import sys
@@ -141,6 +142,10 @@ def _rows(record: dict) -> dict[str, dict[str, Value]]:
     return record["rows"] | {"setting": record.get("setting", {})}
 
 
+def _field(records: dict[str, dict], field: str, name: str) -> str:
+    return records[name][field]
+
+
 def _environment(records: dict[str, dict]) -> jinja2.Environment:
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, finalize=number
@@ -148,7 +153,10 @@ def _environment(records: dict[str, dict]) -> jinja2.Environment:
     environment.globals = {name: _rows(record) for name, record in records.items()} | {
         "table": lambda name, **options: table(records[name], **options),
         "source": lambda name: source(records[name]),
-        "question": lambda name: records[name]["question"],
+        **{
+            field: functools.partial(_field, records, field)
+            for field in ("question", "command", "commit", "machine")
+        },
     }
     return environment
 
