@@ -96,9 +96,7 @@ def bare_numbers(template: str) -> list[tuple[int, str]]:
             for offset, part in enumerate(text.split("\n")):
                 words = NAMES.sub("", QUOTED.sub("", part))
                 found += [(line + offset, token) for token in re.findall(r"\S*\d\S*", words)]
-        elif kind in ("integer", "float"):
-            found.append((line, text))
-        elif kind == "string" and NUMBER.fullmatch(text[1:-1].strip()):
+        elif kind in ("integer", "float", "string") and NUMBER.fullmatch(text.strip("\"' ")):
             found.append((line, text))
     return found
 

@@ -122,7 +122,9 @@ def test_what_a_template_cannot_name_is_refused(tmp_path, changes, message):
 
 def test_a_placeholder_is_filled_in_and_a_strange_one_is_an_error(tmp_path):
     records = {"scans": written(tmp_path, setting={"pairs": 20})}
-    text = "{{ scans.jaxreg.right }} of {{ scans.setting.pairs }}, {{ '%.1f' % scans.jaxreg.error }}"
+    text = (
+        "{{ scans.jaxreg.right }} of {{ scans.setting.pairs }}, {{ '%.1f' % scans.jaxreg.error }}"
+    )
     assert render.render(text, records) == "20 of 20, 0.9"
     for wrong in ("{{ scans.peer.right }}", "{{ scans.jaxreg.wrong }}", "{{ speed.jaxreg.ms }}"):
         with pytest.raises(jinja2.UndefinedError):
