@@ -18,7 +18,7 @@ from jaxreg.refine.kdtree import IndexedCloud, index_cloud
 from jaxreg.refine.uncertainty import PoseUncertainty, about, weak_directions
 from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
-from jaxreg.search.learned import load_network
+from jaxreg.search.learned import load_features
 from jaxreg.search.pipeline import search_poses
 from jaxreg.types import RigidTransform
 
@@ -219,7 +219,7 @@ def _search(learned: bool):
             max_angle=max_angle,
         )
 
-    network = jax.device_put(load_network()) if learned else None
+    network = jax.device_put(load_features()) if learned else None
     return functools.partial(_xla.jit(run), network)
 
 

@@ -6,7 +6,7 @@ one hypothesis from each of the clearest candidates instead of sampling, a grid 
 
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
-from jaxreg.search.learned import load_network
+from jaxreg.search.learned import load_features
 from jaxreg.search.pipeline import Search, register_global, search_described, search_poses
 
 __all__ = [
@@ -14,7 +14,7 @@ __all__ = [
     "Search",
     "SearchConfig",
     "describe",
-    "load_network",
+    "load_features",
     "register_global",
     "search_described",
     "search_poses",
