@@ -11,15 +11,16 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PAGES = {"RESULTS.md": "results.md", "CHANGELOG.md": "changelog.md"}
 PAGES |= {f"examples/{path.name}": f"examples/{path.stem}.md" for path in EXAMPLES}
 """From files of the repository to pages of the site."""
+_WIDE = "---\nhide: [toc]\n---\n\n"  # Tables of results take the whole width.
 
 
 def on_config(config):
     """Notes and examples are found, not listed, so that a new one needs no other change."""
     guides = next(entry["Guides"] for entry in config.nav if "Guides" in entry)
     guides += [{_title(path): f"examples/{path.stem}.md"} for path in EXAMPLES]
-    notes = sorted((ROOT / "docs" / "notes").glob("*.md"))
-    if notes:
-        config.nav.append({"What was tried": [f"notes/{path.name}" for path in notes]})
+    results = next(entry["Results"] for entry in config.nav if "Results" in entry)
+    notes = sorted((ROOT / "docs" / "notes").glob("[0-9]*.md"))
+    results.append({"What was tried": ["notes/README.md", *(f"notes/{p.name}" for p in notes)]})
     config.nav.append({"Changelog": "changelog.md"})
     return config
 
@@ -29,9 +30,8 @@ def on_files(files, config):
     for source, page in PAGES.items():
         path = ROOT / source
         text = path.read_text(encoding="utf-8").replace("](docs/", "](")
-        files.append(
-            File.generated(config, page, content=_page_of(path) if path in EXAMPLES else text)
-        )
+        content = _page_of(path) if path in EXAMPLES else _WIDE + text
+        files.append(File.generated(config, page, content=content))
     return files
 
 
