@@ -1,9 +1,9 @@
 """Calibrate a range sensor by gradients through registration.
 
 A scanner adds an unknown constant to every range that it measures. From two scans of one room, taken
-from two unknown poses, that constant can be learnt: with the right one the scans fit each other best.
-The loss is the residual after registration, and its derivative runs through all iterations of ICP.
-Prints the offset in each step; about ten seconds on a laptop.
+from two unknown poses, that constant can be learned: with the right one the scans fit each other best.
+The loss is the residual after registration, and its derivatives run through all iterations of ICP.
+Prints the offset at each step; about ten seconds on a laptop.
 """
 
 import jax
@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxreg.geometry.rigid import apply
-from jaxreg.refine.point_to_point import icp
+from jaxreg import RefineConfig, apply, icp
 
 TRUE_OFFSET = 0.08  # metres
 STEPS = 8
+CONFIG = RefineConfig(iterations=20, kernel="none")
 
 
 def scan_room(points, rotation, position, rng):
@@ -30,22 +30,22 @@ def corrected(scan, offset):
     return scan * (1 - offset / jnp.linalg.norm(scan, axis=1, keepdims=True))
 
 
-def residual(offset, first, second):
+def loss(offset, first, second):
     """Mean squared distance (m^2) between the corrected scans after ICP has aligned them."""
     first, second = corrected(first, offset), corrected(second, offset)
-    moved = apply(icp(first, second, iterations=20), first)
-    squared = jnp.sum((moved[:, None] - second[None]) ** 2, axis=-1)
-    return jnp.mean(jnp.min(squared, axis=1))
+    fit = icp(first, second, config=CONFIG)
+    moved = apply(fit.transform, first)
+    return jnp.mean(jnp.sum((moved - fit.correspondences) ** 2, axis=1))
 
 
 def calibrate(seed: int = 0) -> float:
-    """The offset learnt from two scans, in metres, by Newton's method through registration."""
+    """The offset learned from two scans, in metres, by Newton's method through registration."""
     rng = np.random.default_rng(seed)
     room = rng.uniform(-1, 1, (150, 3)) * [4.0, 3.0, 1.5]
     turn = Rotation.from_euler("zyx", [6, 2, -3], degrees=True).as_matrix()
     first = scan_room(room, np.eye(3), np.zeros(3), rng)
     second = scan_room(rng.permutation(room), turn, np.array([0.5, -0.3, 0.2]), rng)
-    slope, curvature = jax.jit(jax.grad(residual)), jax.jit(jax.hessian(residual))
+    slope, curvature = jax.jit(jax.grad(loss)), jax.jit(jax.hessian(loss))
     offset = jnp.zeros(())
     for step in range(STEPS):
         newton = slope(offset, first, second) / jnp.abs(curvature(offset, first, second))
@@ -55,4 +55,4 @@ def calibrate(seed: int = 0) -> float:
 
 
 if __name__ == "__main__":
-    print(f"learnt {calibrate():.4f} m, true {TRUE_OFFSET} m")
+    print(f"learned {calibrate():.4f} m, true {TRUE_OFFSET} m")

@@ -39,7 +39,7 @@ from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import match, matching_maps, neighborhood_sum
 from jaxreg.network.model import neighborhood_graph
 from jaxreg.search import description
-from jaxreg.search.learned import load_network
+from jaxreg.search.learned import load_features
 from jaxreg.search.pipeline import enter, search_poses
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from research import train_features as learned_features
@@ -249,7 +249,7 @@ def main() -> None:
     """Train every row with every seed; print a line for each, and one for the control."""
     options = tyro.cli(Options, description=__doc__)
     process.enable_compilation_cache()
-    network = load_network()
+    network = load_features()
     asked = learned_features.Options(data_root=options.data_root, test_seed=options.test_seed)
     sets = learned_features.clouds_to_test_on(asked)
     name = "ModelNet40" if "ModelNet40" in sets else "procedural"

@@ -37,10 +37,9 @@ from jaxreg.evaluation.metrics import pair_errors
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import nearest_neighbor, squared_distances
 from jaxreg.geometry.numerics import safe_norm
-from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import compare, describe
 from jaxreg.search.descriptors import standardized
-from jaxreg.search.learned import init_network, load_network
+from jaxreg.search.learned import feature_config, init_network, load_features
 from jaxreg.search.pipeline import enter, search_poses
 from jaxreg.weights.released import save_weights
 
@@ -241,7 +240,7 @@ def main() -> None:
     process.enable_compilation_cache()
     trained = {"moments": None}
     if options.released and "network" in options.features:
-        trained["network"] = load_network()
+        trained["network"] = load_features()
     to_fit = [name for name in options.features if name not in trained]
     if to_fit:
         clouds = np.stack(
@@ -255,7 +254,7 @@ def main() -> None:
             "steps": options.steps,
             "batch": options.batch,
         }
-        save_weights(options.save, "features", trained["network"], SearchConfig(), card)
+        save_weights(options.save, "features", trained["network"], feature_config(), card)
     if "network" in trained:
         trained["network, 1-NN"] = trained["network"]
     for label, chosen in clouds_to_test_on(options).items():

@@ -33,7 +33,7 @@ from jaxreg.evaluation.metrics import pair_errors
 from jaxreg.geometry import rigid
 from jaxreg.network.model import register_pair
 from jaxreg.scans.pair import register
-from jaxreg.search import load_network, register_global
+from jaxreg.search import load_features, register_global
 from jaxreg.types import Pair, RigidTransform
 from jaxreg.weights.released import load_pretrained
 
@@ -116,7 +116,7 @@ def draw(key, shape, *, config: PairConfig, turned: bool) -> Pair:
 def choose(name: str) -> Solve:
     """One pair to a transform; errors as `jaxreg.classical.choose` and `load_pretrained`."""
     if name in ("dense", "dense_learned"):
-        network = load_network() if name == "dense_learned" else None
+        network = load_features() if name == "dense_learned" else None
         found = _xla.jit(lambda x, y: register_global(x, y, network=network))
     elif name == "register":
         return lambda p: RigidTransform(*register(p.source.points, p.reference.points)[:2])

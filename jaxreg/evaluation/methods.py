@@ -18,7 +18,7 @@ from jaxreg.refine.gicp import gicp
 from jaxreg.refine.point_to_plane import point_to_plane
 from jaxreg.refine.point_to_point import icp
 from jaxreg.scans.pair import register
-from jaxreg.search import load_network, register_global
+from jaxreg.search import load_features, register_global
 from jaxreg.search.learned import Network
 from jaxreg.types import Pair, PointCloud, RigidTransform
 
@@ -142,5 +142,5 @@ def choose_method(name: str) -> methods.Method:
         case "register_global":
             return methods.global_method()
         case "register_global_learned":
-            return methods.global_method(load_network())
+            return methods.global_method(load_features())
     return methods.host_method(baselines.choose(name))

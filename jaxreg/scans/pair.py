@@ -17,7 +17,7 @@ from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, wea
 from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
-from jaxreg.search.learned import load_network as load_features
+from jaxreg.search.learned import load_features
 from jaxreg.search.pipeline import search_described
 from jaxreg.types import RigidTransform
 

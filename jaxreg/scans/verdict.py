@@ -155,5 +155,5 @@ Fitted by research/fit_verdict.py (2026-11-26) to 200 pairs of procedural shapes
 ModelNet40's training shapes: full, noisy and cropped samplings, unrelated shapes, ends of one shape.
 Right poses called a failure on these pairs: 6, 4 and 22 %; no unrelated pair, but 11 % of the ends of
 one shape (many are congruent, as those of a box are) are called a success. A new fit with the search
-that settles close calls (`search.ranking.settle`) judged other pairs no better.
+that settles close calls (`search.ranking.break_ties`) judged other pairs no better.
 """

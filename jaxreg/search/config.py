@@ -1,14 +1,18 @@
 """The settings of the search."""
 
 import dataclasses
+import math
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """What may be set of global registration (`jaxreg.search`).
+    """What may be set of registration without a start (`jaxreg.search`).
 
-    Lengths are in units of the search: a usual shape fills the unit sphere in them. Everything
-    that was fitted, and that nobody needs to change, is a constant beside the code that uses it.
+    Lengths are in units of the search: a usual shape fills the unit sphere in them. What was fitted,
+    and nobody needs to change, is a constant beside the code that uses it.
+
+    Raises:
+      ValueError: a value is not positive.
     """
 
     unit: float | None = None
@@ -24,3 +28,29 @@ class SearchConfig:
     """Distinct poses that are aligned coarsely, those of the largest overlap first."""
     aligned: int = 8
     """Distinct poses that are aligned with exact neighbours and ranked."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where a value is out of range."""
+        if not self.radii:
+            raise ValueError("radii is empty: give one radius or more, in units of the search.")
+        values = {name: value for name, value in vars(self).items() if name != "radii"}
+        if self.unit is None:
+            del values["unit"]
+        for name, value in [*values.items(), *(("radii", radius) for radius in self.radii)]:
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: choose a positive, finite value.")
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureConfig:
+    """What the inputs of a network of features depend on, in units of the search.
+
+    It stands in the card beside the weights, which fit no other inputs.
+    """
+
+    radii: tuple[float, ...]
+    """Radii of the moments."""
+    normal_radius: float
+    """Radius of the neighbourhood of a normal."""
+    openness_radius: float
+    """Radius at which a surface is seen to be open."""

@@ -22,7 +22,7 @@ from jaxreg.search.descriptors import (
     standardized,
 )
 from jaxreg.search.hypotheses import SCREEN_WIDTH
-from jaxreg.search.learned import Network, learned_features
+from jaxreg.search.learned import Network, check_network, learned_features
 from jaxreg.search.nearest import NearestGrid, nearest_grid
 from jaxreg.search.surface import Surface
 
@@ -101,8 +101,16 @@ def compare(source: Described, reference: Described, *, network: Network | None 
     """Features of both clouds in common units, and their cosines.
 
     These features are the moments, or what `network` makes of them; the local ones of the surfaces
-    are the moments at the smallest radius.
+    are the moments at the first radius.
+
+    Raises:
+      ValueError: the clouds were described with different radii, or `network` was trained for others.
     """
+    if source.features.shape[1] != reference.features.shape[1]:
+        raise ValueError(
+            f"the source has {source.features.shape[1]} features and the reference "
+            f"{reference.features.shape[1]}: describe both with the same radii."
+        )
     masks = source.mask, reference.mask
     local = standardized(
         source.features[:, :INVARIANTS], reference.features[:, :INVARIANTS], *masks
@@ -113,6 +121,7 @@ def compare(source: Described, reference: Described, *, network: Network | None 
     ]
     one, other = standardized(source.features, reference.features, *masks)
     if network is not None:
+        check_network(network, source.features.shape[1])
         one, other = (
             learned_features(network, moments, s.openness, s.points, s.normals, s.mask)
             for moments, s in zip((one, other), surfaces, strict=True)
@@ -121,14 +130,16 @@ def compare(source: Described, reference: Described, *, network: Network | None 
 
 
 def check_cloud(name: str, points: Array, mask: Array | None) -> None:
-    """Raises ValueError unless `points` is (n, 3) with a row, and `mask` None or (n,)."""
+    """Raises ValueError unless `points` is (n, 3) of floats, n >= 1, and `mask` (n,) of bools."""
     if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
         raise ValueError(
             f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, and use "
             "jax.vmap for a batch."
         )
-    if mask is not None and mask.shape != points.shape[:1]:
+    if not jnp.issubdtype(points.dtype, jnp.floating):
+        raise ValueError(f"{name} must be of floats, got {points.dtype}: convert it to float32.")
+    if mask is not None and (mask.shape != points.shape[:1] or mask.dtype != bool):
         raise ValueError(
-            f"the mask of {name} must have shape {points.shape[:1]}, got {mask.shape}: give one bool "
-            "for every row, True where it is a point."
+            f"the mask of {name} must be bool of shape {points.shape[:1]}, got {mask.dtype} of "
+            f"{mask.shape}: give True for every row that is a point, False for padding."
         )

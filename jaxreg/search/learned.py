@@ -4,8 +4,7 @@ They are invariant to rigid motion as the moments are, since nothing enters but 
 cosines. Trained on pairs of procedural shapes by `python -m research.train_features`.
 """
 
-import io
-from importlib import resources
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +14,24 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_norm
+from jaxreg.search.config import FeatureConfig, SearchConfig
+from jaxreg.search.descriptors import INVARIANTS, NORMAL_RADIUS, OPENNESS_RADIUS
+from jaxreg.weights.released import load_arrays
 
 Network = dict[str, Float[Array, "..."] | Float[np.ndarray, "..."]]
 """A matrix for every layer, and its bias under the same name with "_bias"."""
 
+_DEFAULT = SearchConfig()
 _WIDTH = 64
-_MOMENTS = 48
 _NEIGHBORS = 64
 """Neighbours of a point: the nearest 16 pass the first messages, every fourth the second."""
 _ROUNDS = (("near", slice(0, 16), 0.15), ("far", slice(3, None, 4), 0.3))
 _EDGE = 4
 
 
-def init_network(key: PRNGKeyArray) -> Network:
-    """Random weights of `learned_features`, Glorot uniform."""
-    sizes = {"lift": (_MOMENTS + 1, _WIDTH), "last": (_WIDTH, _WIDTH)}
+def init_network(key: PRNGKeyArray, inputs: int = len(_DEFAULT.radii) * INVARIANTS) -> Network:
+    """Random weights of `learned_features` of that many moments of a point, Glorot uniform."""
+    sizes = {"lift": (inputs + 1, _WIDTH), "last": (_WIDTH, _WIDTH)}
     for name, _, _ in _ROUNDS:
         sizes |= {
             f"{name}_edge": (_EDGE, _WIDTH),
@@ -44,11 +46,51 @@ def init_network(key: PRNGKeyArray) -> Network:
     return weights | {f"{name}_bias": jnp.zeros(size[1]) for name, size in sizes.items()}
 
 
-def load_network() -> Network:
-    """The released weights (numpy arrays), for `register_global`."""
-    file = resources.files("jaxreg") / "weights" / "features.npz"
-    with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+def feature_config(config: SearchConfig = _DEFAULT) -> FeatureConfig:
+    """What a network learns from when it is trained for this search."""
+    return FeatureConfig(config.radii, NORMAL_RADIUS, OPENNESS_RADIUS)
+
+
+def load_features(name: str = "features", *, config: SearchConfig = _DEFAULT) -> Network:
+    """The weights (numpy arrays) of a network of features, for the `network` of `register_global`.
+
+    `name` is that of released weights, or the path of your own without the suffix.
+
+    Raises:
+      ValueError: there are no such weights, they are not those of such a network, or they were trained
+        for a search with other descriptors than that of `config`.
+    """
+    network, card = load_arrays(name)
+    trained = card["config"]
+    for field, value in dataclasses.asdict(feature_config(config)).items():
+        if field not in trained:
+            raise ValueError(
+                f"the weights '{name}' are not those of features of the search: their card says "
+                f"nothing of {field}. The released ones are called 'features'."
+            )
+        if not np.array_equal(trained[field], value):
+            raise ValueError(
+                f"the weights '{name}' were trained with {field} = {trained[field]}, and this search "
+                f"has {value}: set it as it was, or train others (research/train_features.py)."
+            )
+    check_network(network, len(config.radii) * INVARIANTS)
+    return network
+
+
+def check_network(network: Network, inputs: int) -> None:
+    """Raises ValueError unless `network` takes `inputs` moments of a point."""
+    expected = jax.eval_shape(lambda: init_network(jax.random.key(0), inputs))
+    for name, weights in expected.items():
+        if name not in network:
+            raise ValueError(
+                f"the network has no weights '{name}': take them from load_features()."
+            )
+        if network[name].shape != weights.shape:
+            raise ValueError(
+                f"the weights '{name}' of the network have shape {network[name].shape} and should have "
+                f"{weights.shape} for {inputs} moments of a point: choose as many radii in "
+                "SearchConfig as the network was trained with."
+            )
 
 
 def learned_features(

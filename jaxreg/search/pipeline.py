@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.geometry import frame, rigid
 from jaxreg.refine.gicp import gicp
 from jaxreg.search.alignment import FINE_EPSILON, align_coarse, align_fine
-from jaxreg.search.candidates import select_candidates
+from jaxreg.search.candidates import MATCHES, select_candidates
 from jaxreg.search.compatibility import compatibility
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.description import Compared, Described, compare, describe
+from jaxreg.search.description import Compared, Described, check_cloud, compare, describe
 from jaxreg.search.hypotheses import (
     CONSENSUS_SIZE,
     Separation,
@@ -36,7 +36,7 @@ from jaxreg.search.ranking import (
     sparsity_factor,
 )
 from jaxreg.search.surface import Surface, thinned
-from jaxreg.types import Registration, RigidTransform
+from jaxreg.types import GlobalRegistration, RigidTransform
 
 _DEFAULT = SearchConfig()
 _RMS_OF_UNIT_SPHERE = 0.5
@@ -80,12 +80,13 @@ def register_global(
     reference_mask: Bool[Array, "m"] | None = None,
     network: Network | None = None,
     similarity: Float[Array, "n m"] | None = None,
+    max_angle: Float[Array, ""] | float = math.pi,
     config: SearchConfig = _DEFAULT,
-) -> Registration:
+) -> GlobalRegistration:
     """The pose of the source in the frame of the reference, from any start.
 
     Points are matched by their moments, without learning; or, given a `network`
-    (`jaxreg.search.load_network`), by what it makes of these; or by a `similarity` of your own, the
+    (`jaxreg.search.load_features`), by what it makes of these; or by a `similarity` of your own, the
     cosines in [-1, 1] of any features.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
@@ -93,14 +94,22 @@ def register_global(
     the search. The pose is differentiable in both clouds through the last refinement alone: the
     search is discrete.
 
+    `max_angle` (radians) bounds how far the clouds may be turned, which settles symmetric shapes; where
+    the search finds no pose within it, the best of all is returned. `score` is that of `ranking`, of
+    the pose before the last refinement.
+
     Raises:
-      ValueError: a cloud is not (n, 3) or has fewer than four rows.
+      ValueError: a cloud is not (n, 3) of floats or has fewer than four rows, a mask or the similarity
+        has another shape, `max_angle` is not in (0, pi], or `network` was trained for other radii.
     """
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
-    described = [
-        describe(p, m, unit=1.0, config=config) for p, m in ((x, source_mask), (y, reference_mask))
-    ]
-    found = search_described(*described, network=network, similarity=similarity, config=config)
+    described = (
+        describe(x, source_mask, unit=1.0, config=config),
+        describe(y, reference_mask, unit=1.0, config=config),
+    )
+    found = search_described(
+        *described, network=network, similarity=similarity, max_angle=max_angle, config=config
+    )
     start = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), found.poses)
     sparsity = sparsity_factor(*(cloud.spacing for cloud in described))
     pose = gicp(
@@ -118,7 +127,9 @@ def register_global(
         partners=2,
         edges=True,
     )
-    return _registration(where, pose, x, y, *(cloud.mask for cloud in described))
+    return _registration(
+        where, pose, (x, y), (described[0].mask, described[1].mask), found.score[0]
+    )
 
 
 def search_poses(
@@ -170,6 +181,7 @@ def search_described(
     Raises:
       ValueError: as `search_poses`.
     """
+    _check_search(source, reference, similarity, also, max_angle)
     compared = compare(source, reference, network=network)
     if similarity is not None:
         compared = compared._replace(similarity=similarity)
@@ -197,9 +209,34 @@ def enter(
 
     `unit` is `SearchConfig.unit`. Errors as `register_global`.
     """
+    check_cloud("source", source, source_mask)
+    check_cloud("reference", reference, reference_mask)
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
     factor = _RMS_OF_UNIT_SPHERE if unit is None else where.length / unit
     return where._replace(length=where.length / factor), x * factor, y * factor
+
+
+def _check_search(source: Described, reference: Described, similarity, also, max_angle) -> None:
+    n, m = len(source.mask), len(reference.mask)
+    if min(n, m) <= MATCHES:
+        raise ValueError(
+            f"the clouds have {n} and {m} rows, and the search needs {MATCHES + 1}: give more points, "
+            "or pad smaller clouds and give masks."
+        )
+    if similarity is not None and similarity.shape != (n, m):
+        raise ValueError(
+            f"similarity must have shape {(n, m)}, a row for every source point and a column for every "
+            f"reference point, got {similarity.shape}."
+        )
+    if also is not None and (also.rotation.shape, also.translation.shape) != ((3, 3), (3,)):
+        raise ValueError(
+            f"also must be one transform with a rotation (3, 3) and a translation (3,), got "
+            f"{also.rotation.shape} and {also.translation.shape}."
+        )
+    if not isinstance(max_angle, jax.core.Tracer) and not 0 < max_angle <= math.pi + 1e-6:
+        raise ValueError(
+            f"max_angle = {max_angle}: give an angle in (0, pi], in radians (np.radians(degrees))."
+        )
 
 
 def _hypotheses(compared: Compared, config: SearchConfig) -> RigidTransform:
@@ -284,15 +321,24 @@ def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]
     return trace >= 1 + 2 * jnp.cos(jnp.minimum(angle, math.pi)) - 1e-5
 
 
-def _registration(where, pose, x, y, source_mask, reference_mask) -> Registration:
+def _registration(
+    where: frame.Frame,
+    pose: RigidTransform,
+    clouds: tuple[Array, Array],
+    masks: tuple[Array, Array],
+    score: Array,
+) -> GlobalRegistration:
+    """The result in the frame and unit of the input; the identity where a cloud has no point."""
+    (source, reference), (source_mask, reference_mask) = clouds, masks
     valid = jnp.any(source_mask) & jnp.any(reference_mask)
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
-    moved = rigid.apply(pose, x)
-    nearest = nearest_packed(moved, y, reference_mask)
-    squared = jnp.sum((moved - y[nearest]) ** 2, axis=-1)
-    trust = jnp.exp(-squared / (2 * NEAR_WIDTH**2))
-    trust = jnp.where(source_mask & valid, trust, 0)
+    identity = rigid.identity(source.dtype)
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, identity)
+    moved = rigid.apply(pose, source)
+    nearest = nearest_packed(moved, reference, reference_mask)
+    squared = jnp.sum((moved - reference[nearest]) ** 2, axis=-1)
+    trust = jnp.where(source_mask & valid, jnp.exp(-squared / (2 * NEAR_WIDTH**2)), 0)
+    correspondences = reference[nearest] * where.length + where.reference_centre[None, :]
     pose = frame.transform_out(where, pose)
-    correspondences = y[nearest] * where.length + where.reference_centre[None, :]
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, rigid.identity(x.dtype))
-    return Registration(*pose, rigid.to_matrix(pose), trust, correspondences, valid)
+    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, identity)
+    matrix = rigid.to_matrix(pose)
+    return GlobalRegistration(*pose, matrix, trust, correspondences, score, valid)

@@ -141,7 +141,6 @@ def break_ties(
     return jnp.where(close, score + change, score)
 
 
-@jax.jit  # Traced once for both directions.
 def _one_way(
     moved: Surface,
     other: Surface,

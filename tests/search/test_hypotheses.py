@@ -58,3 +58,13 @@ def test_distinct_poses_are_a_greedy_choice(seed):
         left = [k for k in left if not same(k)]
     assert found.tolist() == expected
     assert np.array_equal(best_of(poses, found).translation, translation[expected])
+
+
+def test_a_second_round_begins_when_no_distinct_pose_is_left():
+    """Two places with two poses each, and one far away that is not allowed."""
+    shifts = jnp.asarray([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [5.1, 0, 0], [9, 0, 0]])
+    poses = RigidTransform(jnp.tile(jnp.eye(3), (5, 1, 1)), shifts)
+    score, allowed = jnp.asarray([1.0, 4, 3, 2, 9]), jnp.asarray([True] * 4 + [False])
+    found = pick_distinct(poses, score, allowed, count=4, apart=Separation(0.1, 1.0))
+    assert found.tolist() == [1, 2, 4, 1]
+    assert pick_distinct(poses, score, count=3, apart=Separation(0.1, 1.0)).tolist() == [4, 1, 2]

@@ -5,8 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural import shapes
+from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import compare, describe
-from jaxreg.search.learned import init_network, learned_features
+from jaxreg.search.learned import (
+    check_network,
+    init_network,
+    learned_features,
+    load_features,
+)
 
 pytestmark = [pytest.mark.float32]
 N, ROWS = 400, 448
@@ -111,3 +117,23 @@ def test_messages_are_the_equation(seed):
     expected = layer("last", gelu(hidden))
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_released_weights_fit_the_search_they_are_loaded_for():
+    network = load_features()
+    check_network(network, 48)
+    with pytest.raises(
+        ValueError, match=r"trained with radii = \[0.2, 0.4, 0.8\], and this search"
+    ):
+        load_features(config=SearchConfig(radii=(0.1, 0.4, 0.8)))
+    with pytest.raises(ValueError, match="not those of features of the search"):
+        load_features("modelnet40")
+    with pytest.raises(ValueError, match="no released weights 'nothing'"):
+        load_features("nothing")
+
+
+def test_weights_of_another_size_are_named(seed):
+    network = init_network(jax.random.key(seed), inputs=32)
+    check_network(network, 32)
+    with pytest.raises(ValueError, match=r"'lift' of the network have shape \(33, 64\)"):
+        check_network(network, 48)
