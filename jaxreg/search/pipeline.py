@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.neighbors import squared_distances
 from jaxreg.geometry.numerics import safe_sqrt
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.gicp import gicp
 from jaxreg.search.alignment import align_coarse, align_fine
 from jaxreg.search.candidates import select_candidates
@@ -72,15 +73,17 @@ def register_global(
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
-        iterations=config.final_iterations,
-        max_distance=config.final_reach * jax.lax.stop_gradient(widening),
-        anneal=config.final_anneal,
-        both_directions=True,
-        neighbors=min(config.final_neighbors, min(len(x), len(y)) - 1),
-        thickness=config.thickness,
-        partners=config.final_partners,
-        edges=True,
-    )
+        config=RefineConfig(
+            iterations=config.final_iterations,
+            kernel_annealing=config.final_anneal,
+            both_directions=True,
+            k=min(config.final_neighbors, min(len(x), len(y)) - 1),
+            epsilon=config.thickness,
+            correspondences_per_point=config.final_partners,
+            edges=True,
+        ),
+        max_correspondence_distance=config.final_reach * jax.lax.stop_gradient(widening),
+    ).transform
     return _registration(where, pose, x, y, source_mask, reference_mask, config)
 
 
