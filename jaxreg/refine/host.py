@@ -11,7 +11,7 @@ import numpy as np
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_points
 from jaxreg.geometry.rigid import nearest_rotation
-from jaxreg.refine.config import RefineConfig, check_config
+from jaxreg.refine.config import RefineConfig, check_options
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud, iterate
 from jaxreg.refine.robust import Weighting
 from jaxreg.refine.uncertainty import PoseUncertainty, uncertainty_of_pairs
@@ -87,7 +87,7 @@ def refine_indexed(
 
     `distance` is the largest of corresponding points, in the unit of the frame.
     """
-    check_config(config)
+    check_options(config)
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
     pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config)
     # It is orthogonal to float32 only, until here.
@@ -97,7 +97,7 @@ def refine_indexed(
     forward = np.arange(len(pairs.mask)) < len(source.points)
     uncertainty = _uncertainty(
         pose, source.padded, source.scale, reference.padded, reference.scale, reference.normals,
-        pairs._replace(mask=pairs.mask & forward), weighting.max_distance,
+        pairs._replace(mask=pairs.mask & forward), weighting.max_correspondence_distance,
         kernel=config.kernel, trim=config.trim,
     )  # fmt: skip
     values = PoseUncertainty(*(np.asarray(leaf, np.float64) for leaf in uncertainty))

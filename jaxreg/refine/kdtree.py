@@ -4,6 +4,8 @@ The tree finds the pairs in float64 on the CPU, the step is the pure one of `icp
 or `gicp`, jitted. Arrays are padded to a few sizes, so that a new size of cloud seldom compiles.
 """
 
+import dataclasses
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -16,9 +18,8 @@ from jaxreg.geometry.clouds import padded_size
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs
-from jaxreg.refine.gicp import gicp_step
-from jaxreg.refine.point_to_plane import point_to_plane_step
-from jaxreg.refine.point_to_point import point_to_point_step
+from jaxreg.refine.cost import Scene, match
+from jaxreg.refine.methods import method_of
 from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import RigidTransform
 
@@ -89,7 +90,11 @@ def iterate(
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     widths = np.concatenate([widths, np.ones_like(widths)])
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
-    levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, widths[len(widths) // 2 :])]
+    levels = (
+        [(stride, widths)] if stride == 1 else [(stride, widths), (1, widths[len(widths) // 2 :])]
+    )
+    # The distance is in the weighting; one of every pair its own would compile every time.
+    settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
         i, converged = 0, False
@@ -98,8 +103,9 @@ def iterate(
                 pose, source, reference, stride, both_directions=config.both_directions
             )
             new = _step(
-                pose, source[2:], reference[2:], pairs, weighting[1:3], widths[i], config=config
-            )
+                pose, source[2:], reference[2:], pairs, weighting.kernel_scale,
+                weighting.max_correspondence_distance, float(widths[i]), config=settings,
+            )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
             still = _change(pose, new) < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
@@ -146,24 +152,22 @@ def _described(points, neighbors, given):
 
 
 @partial(jax.jit, static_argnames="config")
-def _step(pose, source, reference, pairs, scale_and_distance, width, *, config: RefineConfig):
-    x, source_normals, source_edges, source_scale = source
-    y, reference_normals, reference_edges, reference_scale = reference
-    x, y = x * source_scale, y * reference_scale
-    weighting = Weighting(config.kernel, *scale_and_distance, config.trim)
+def _step(pose, source, reference, pairs, kernel_scale, distance, width, *, config: RefineConfig):
+    (x, *source_shape, source_scale), (y, *reference_shape, reference_scale) = source, reference
+    weighting = Weighting(config.kernel, kernel_scale, distance, config.trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
-    if config.method == "icp":
-        return point_to_point_step(pose, x, y, pairs, weighting, width)
-    if config.method == "point_to_plane":
-        return point_to_plane_step(pose, x, y, reference_normals, pairs, weighting, width)
-    covariances = (
-        surface_covariances(across, config.epsilon, ends if config.edges else None)
-        for across, ends in (
-            (source_normals, source_edges),
-            (reference_normals, reference_edges),
-        )
-    )
-    return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=config.epsilon)
+    surfaces = (_surface(shape, config) for shape in (source_shape, reference_shape))
+    scene = Scene(x * source_scale, y * reference_scale, *surfaces, weighting)
+    method = method_of(config)
+    return method.step(pose, match(scene, pose, pairs, method, width))
+
+
+def _surface(shape, config: RefineConfig):
+    """What the method knows of a surface with these normals and edges."""
+    across, ends = shape
+    if config.method == "gicp":
+        return surface_covariances(across, config.epsilon, ends if config.edges else None)
+    return across
 
 
 def _change(old: RigidTransform, new: RigidTransform) -> float:

@@ -216,7 +216,9 @@ def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
     return _Found(_nth(poses, best), rival, alternatives)
 
 
-def _searched_poses(problem: _Problem, most: float) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
+def _searched_poses(
+    problem: _Problem, most: float
+) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
     """The poses of the search in the frame of the pair, in float64, their scores, which are allowed."""
     where, config = problem.where, problem.config
     # Twice the radius: a usual shape then fills the unit sphere.

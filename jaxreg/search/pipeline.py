@@ -3,6 +3,7 @@
 Pure functions of one pair: compose them with `jax.jit`, `jax.vmap` and `jax.grad`.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import frame, rigid
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.gicp import gicp
 from jaxreg.search.alignment import FINE_EPSILON, align_coarse, align_fine
 from jaxreg.search.candidates import MATCHES, select_candidates
@@ -49,6 +51,18 @@ _ALIGNED_APART = Separation(angle=0.1, distance=0.05)
 """Poses nearer than this are drawn to one pose by the fine alignment."""
 _FINAL_REACH = 0.06
 """Largest distance of the pairs of the last refinement, in units of the search, for dense clouds."""
+
+
+_FINAL = RefineConfig(
+    iterations=15,
+    kernel_annealing=8.0,
+    both_directions=True,
+    k=16,
+    epsilon=FINE_EPSILON,
+    correspondences_per_point=2,
+    edges=True,
+)
+"""The last refinement, of the best pose alone."""
 
 
 class Search(NamedTuple):
@@ -118,15 +132,9 @@ def register_global(
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
-        iterations=15,
-        max_distance=_FINAL_REACH * sparsity,
-        anneal=8.0,
-        both_directions=True,
-        neighbors=min(16, min(len(x), len(y)) - 1),
-        thickness=FINE_EPSILON,
-        partners=2,
-        edges=True,
-    )
+        config=dataclasses.replace(_FINAL, k=min(_FINAL.k, min(len(x), len(y)) - 1)),
+        max_correspondence_distance=_FINAL_REACH * sparsity,
+    ).transform
     return _registration(
         where, pose, (x, y), (described[0].mask, described[1].mask), found.score[0]
     )
