@@ -139,7 +139,7 @@ def padded(
 
 
 def padded_size(count: int, *, smallest: int) -> int:
-    """The smallest of ``smallest * 2^k`` that holds `count`: every size compiles programs of its own."""
+    """The smallest of ``smallest * 2^k`` that holds `count`: every size compiles its own programs."""
     size = smallest
     while size < count:
         size *= 2

@@ -32,5 +32,5 @@ class RegisterConfig:
     """A point agrees with the other cloud within this many spacings of it, those of the clouds reduced
     to `search_points`."""
     refine_spacings: float = 2.0
-    """Largest distance of corresponding points in the refinement, in spacings of the clouds that it has,
+    """Largest distance of corresponding points in the refinement, in spacings of the clouds it has,
     where `refine.max_correspondence_distance` says nothing else."""

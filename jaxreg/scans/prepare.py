@@ -278,7 +278,7 @@ def _from_corner(points: np.ndarray) -> list[np.ndarray]:
 
 
 def _cubes(columns: list[np.ndarray], size: float) -> Int[np.ndarray, "n"]:
-    """A number for the cube of edge `size` that every point lies in; lexicographic, few of them unused."""
+    """A number for the cube of edge `size` that every point lies in, in lexicographic order."""
     cells = [(column / size).astype(np.int64) for column in columns]
     extent = [int(cell.max()) + 1 for cell in cells]
     if math.prod(extent) > _CUBES:
