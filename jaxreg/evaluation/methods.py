@@ -1,7 +1,5 @@
 """Every method that can be scored, by its name: one function from a batch of pairs to transforms."""
 
-import dataclasses
-import inspect
 from collections.abc import Callable
 
 import jax
@@ -14,9 +12,7 @@ from jaxreg.config import ModelConfig
 from jaxreg.evaluation import baselines, methods
 from jaxreg.network.model import Variables, iterate
 from jaxreg.refine.config import RefineConfig
-from jaxreg.refine.gicp import gicp
-from jaxreg.refine.point_to_plane import point_to_plane
-from jaxreg.refine.point_to_point import icp
+from jaxreg.refine.methods import refine
 from jaxreg.scans.pair import register
 from jaxreg.search import load_features, register_global
 from jaxreg.search.learned import Network
@@ -64,14 +60,13 @@ def identity_method(pair: Pair) -> RigidTransform:
 
 @jit
 def icp_method(pair: Pair) -> RigidTransform:
-    """Point-to-point ICP of this library from the identity."""
-    one = lambda source, reference: icp(  # noqa: E731
-        source.points,
-        reference.points,
-        iterations=50,
-        source_mask=source.mask,
-        reference_mask=reference.mask,
-    )
+    """Plain point-to-point ICP of this library from the identity."""
+    config = RefineConfig("icp", iterations=50, kernel="none")
+
+    def one(source, reference):
+        masks = {"source_mask": source.mask, "reference_mask": reference.mask}
+        return refine(source.points, reference.points, config=config, **masks).transform
+
     return map_pairs(one)(pair.source, pair.reference)
 
 
@@ -93,15 +88,12 @@ def refined_method(method: Method, refine: Refinement) -> Method:
 
 
 def refinement(config: RefineConfig) -> Refinement:
-    """The ICP family from given poses of a batch; each gets the fields of `config` it takes."""
-    refine = {"icp": icp, "point_to_plane": point_to_plane, "gicp": gicp}[config.method]
-    taken = inspect.signature(refine).parameters
-    names = [field.name for field in dataclasses.fields(config) if field.name in taken]
-    options = {name: getattr(config, name) for name in names}
+    """The ICP family from given poses of a batch."""
 
     def one(source, reference, initial):
         masks = {"source_mask": source.mask, "reference_mask": reference.mask}
-        return refine(source.points, reference.points, initial=initial, **masks, **options)
+        refined = refine(source.points, reference.points, initial=initial, config=config, **masks)
+        return refined.transform
 
     refine_batch = jit(map_pairs(one))
     return lambda pair, initial: refine_batch(pair.source, pair.reference, initial)

@@ -201,7 +201,7 @@ def _refinement(name: str) -> methods.Refinement | None:
         raise ValueError(f"no refinement '{name}': choose one of {', '.join(_REFINEMENTS)}.")
     # From nearby: a kernel that starts ten times as wide, as for a pose that may be far off, has drawn
     # the exact pose of a flight of stairs to the next step. Ten iterations end where thirty do.
-    return methods.refinement(RefineConfig(method=name, anneal=1.0, iterations=10))
+    return methods.refinement(RefineConfig(method=name, kernel_annealing=1.0, iterations=10))
 
 
 def _read_transforms(path: str, count: int) -> RigidTransform:

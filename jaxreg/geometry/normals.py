@@ -82,23 +82,23 @@ def edge_normals(
 
 def surface_covariances(
     unit_normals: Float[Array, "n 3"],
-    thickness: float,
+    epsilon: float,
     edges: Float[Array, "n 3"] | None = None,
 ) -> Float[Array, "n 3 3"]:
-    """``I - (1 - thickness) n n^T``: variance 1 along the plane, `thickness` across it.
+    """``I - (1 - e) n n^T``: variance 1 along the plane, ``e = epsilon`` across it.
 
     The regularisation of generalised ICP (Segal, Haehnel and Thrun, 2009, section III.B). A zero
     normal gives the identity: nothing is known about the surface there.
 
-    With `edges` (`edge_normals`) the surface also ends: ``- (1 - thickness) e e^T``. On an edge the
-    distance across it says where the point is, and of two plates nothing else says how far one has
-    slid along the other. An edge is met by an edge only: a point whose partner lies inside a surface
-    is as free as before.
+    With `edges` (`edge_normals`) the surface also ends: ``- (1 - e) b b^T`` with ``b`` across its
+    edge. On an edge the distance across it says where the point is, and of two plates nothing else
+    says how far one has slid along the other. An edge is met by an edge only: a point whose partner
+    lies inside a surface is as free as before.
     """
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
     if edges is not None:
         outer = outer + edges[:, :, None] * edges[:, None, :]
-    return jnp.eye(3, dtype=outer.dtype)[None] - (1 - thickness) * outer
+    return jnp.eye(3, dtype=outer.dtype)[None] - (1 - epsilon) * outer
 
 
 def smallest_eigenvector(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:

@@ -1,38 +1,82 @@
-"""The settings of a refinement."""
+"""The settings of a refinement, and their check."""
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Literal, get_args
+
+Method = Literal["icp", "point_to_plane", "gicp"]
+Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"]
+Gradient = Literal["unrolled", "implicit"]
 
 
 @dataclasses.dataclass(frozen=True)
 class RefineConfig:
-    """Refinement of a pose by the ICP family."""
+    """Refinement of a pose by the ICP family.
 
-    method: Literal["icp", "point_to_plane", "gicp"] = "gicp"
-    """Point to point, point to plane, or generalised (plane to plane)."""
+    Hashable: give it to `jax.jit` as a static argument. What changes from call to call, the largest
+    distance and the width of the kernel, the functions also take as arrays.
+    """
+
+    method: Method = "gicp"
+    """Point to point, point to plane, or generalised (plane to plane): that of `refine`. The
+    functions `icp`, `point_to_plane` and `gicp` are what their names say."""
     iterations: int = 30
     """Iterations, each with fresh correspondences."""
-    max_distance: float = math.inf
+    max_correspondence_distance: float = math.inf
     """Pairs farther apart than this (unit of the clouds) do not count."""
     trim: float = 1.0
     """Share of the closest pairs that count."""
-    kernel: Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"] = "geman_mcclure"
-    """Robust weight of the pairs. (The function `icp` alone is plain unless told.)"""
-    anneal: float = 10.0
-    """How many times wider the kernel is in the first iteration than in the last."""
+    kernel: Kernel = "geman_mcclure"
+    """Robust weight of the pairs; "none" is plain least squares."""
+    kernel_annealing: float = 10.0
+    """How many times wider the kernel is in the first iteration than in the last (graduated
+    non-convexity)."""
     both_directions: bool = False
     """Also pair every reference point with its nearest source point."""
-    neighbors: int = 10
+    k: int = 10
     """Neighbours of a point that its normal is computed from."""
-    thickness: float = 1e-3
+    epsilon: float = 1e-3
     """Variance across a surface, in units of the variance along it (generalised ICP)."""
+    correspondences_per_point: int = 1
+    """Partners of a point: the nearest and its neighbours. Several planes of a noisy surface agree
+    on where it is better than one does (generalised ICP)."""
     edges: bool = False
     """Surfaces end: their edges must meet, too (generalised ICP)."""
-    weak_threshold: float = 0.01
-    """A motion is weak when it changes the distances to the surfaces by a smaller mean square than
-    this, for a motion of one (1/3 for surfaces that face all ways)."""
-    dense_limit: int = 1024
-    """Largest cloud, in points, whose pairs are found by brute force; above, by a tree on the host."""
     tolerance: float = 1e-5
-    """The host stops when a step turns by less (radians) and moves by less (in radii of the cloud)."""
+    """Converged is a pose whose last step turned by less than this (radians) and moved by less (in
+    radii of the clouds)."""
+    gradient: Gradient = "unrolled"
+    """How the pose is differentiated; its value is the same.
+
+    "unrolled" goes back through every iteration: exact for the iterations that were made, whether
+    they converged or not, also twice; memory grows with their number. "implicit" applies the
+    implicit function theorem at the pose found: memory and time of one iteration, and the gradient
+    of the *solution*, right where the iterations converged. Take it inside training and wherever
+    there are many iterations. A motion that the pairs leave free keeps the derivative of the start.
+    Second derivatives of "implicit" are not those of the solution."""
+
+
+def check_options(config: RefineConfig) -> None:
+    """Raises ValueError, with the value and what to choose instead, where `config` makes no sense."""
+    for name, choices in (("method", Method), ("kernel", Kernel), ("gradient", Gradient)):
+        if getattr(config, name) not in get_args(choices):
+            raise ValueError(
+                f"{name} '{getattr(config, name)}' does not exist: choose "
+                f"{', '.join(get_args(choices))}."
+            )
+    most = config.k + 1
+    for name, sensible, remedy in (
+        ("iterations", config.iterations >= 1, "choose at least 1"),
+        ("max_correspondence_distance", config.max_correspondence_distance > 0,
+         "choose a positive distance, or infinity for no limit"),
+        ("trim", 0 < config.trim <= 1, "choose a share of the pairs, 0 < trim <= 1"),
+        ("kernel_annealing", config.kernel_annealing >= 1,
+         "choose 1 or more: less would narrow the first kernel"),
+        ("k", config.k >= 2, "choose at least 2: a plane needs a point and two neighbours"),
+        ("epsilon", 0 < config.epsilon <= 1, "choose 0 < epsilon <= 1"),
+        ("correspondences_per_point", 1 <= config.correspondences_per_point <= most,
+         f"choose 1 to k + 1 = {most}, since the others are neighbours of the first"),
+        ("tolerance", config.tolerance >= 0, "choose 0 or more"),
+    ):  # fmt: skip
+        if not sensible:
+            raise ValueError(f"{name} = {getattr(config, name)}: {remedy}.")

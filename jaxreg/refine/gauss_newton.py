@@ -5,6 +5,7 @@ kind of ICP it is: ``w I`` point to point, ``w n n^T`` point to plane, ``w (C_y 
 generalised.
 """
 
+import jax
 import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
@@ -80,6 +81,17 @@ def update_left(
     correction = 1.5 * jnp.eye(3, dtype=gram.dtype) - 0.5 * gram
     shift = jnp.matmul(turn, pose.translation, precision=Precision.HIGHEST) + translation
     return RigidTransform(jnp.matmul(product, correction, precision=Precision.HIGHEST), shift)
+
+
+def perturbation(pose: RigidTransform) -> Float[Array, "6"]:
+    """Zero, with the derivative of the motion ``(omega, v)`` of `update_left` that moves `pose`."""
+    fixed = jax.lax.stop_gradient(pose)
+    turn = jnp.matmul(pose.rotation, fixed.rotation.T, precision=Precision.HIGHEST)
+    # At the identity the skew part has the derivative of the logarithm.
+    skew_part = (turn - turn.T) / 2
+    rotation = jnp.stack([skew_part[2, 1], skew_part[0, 2], skew_part[1, 0]])
+    turned = jnp.matmul(turn, fixed.translation, precision=Precision.HIGHEST)
+    return jnp.concatenate([rotation, pose.translation - turned])
 
 
 def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -4,8 +4,10 @@ The tree finds the pairs in float64 on the CPU, the step is the pure one of `icp
 or `gicp`, jitted. Arrays are padded to a few sizes, so that a new size of cloud seldom compiles.
 """
 
+import dataclasses
+import math
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,14 +15,12 @@ from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs
-from jaxreg.refine.gicp import gicp_step
-from jaxreg.refine.point_to_plane import point_to_plane_step
-from jaxreg.refine.point_to_point import point_to_point_step
-from jaxreg.refine.robust import Weighting
+from jaxreg.refine.cost import Scene, match
+from jaxreg.refine.methods import method_of
+from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import RigidTransform
-
-Method = Literal["icp", "point_to_plane", "gicp"]
 
 _COARSE = 30_000
 """Points of a cloud that find the pose before all of them polish it."""
@@ -38,13 +38,13 @@ class IndexedCloud(NamedTuple):
     edge_normals: Float[Array, "n 3"]
 
 
-def index_cloud(points: np.ndarray, *, neighbors: int) -> IndexedCloud:
+def index_cloud(points: np.ndarray, *, k: int) -> IndexedCloud:
     """Tree, normals and edges of a cloud (n, 3)."""
     tree = cKDTree(points)
     # One more than asked for: the point finds itself, and a row of its own index does not count.
-    _, index = tree.query(points, k=neighbors + 1, workers=-1)
+    _, index = tree.query(points, k=k + 1, workers=-1)
     size = padded_size(len(points))
-    rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, neighbors + 1)).copy()
+    rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, k + 1)).copy()
     rows[: len(points)] = index
     padded = jax.device_put(np.pad(points, ((0, size - len(points)), (0, 0))))
     return IndexedCloud(points, tree, padded, *_normals(padded, rows))
@@ -55,35 +55,32 @@ def iterate(
     source: IndexedCloud,
     reference: IndexedCloud,
     weighting: Weighting,
-    widths: np.ndarray,
     *,
-    method: Method,
-    thickness: float,
-    edges: bool,
-    both_directions: bool,
-    tolerance: float,
+    config: RefineConfig,
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    `widths` are the widenings of the kernel, 1 the last. Where a step is below `tolerance` half of
-    the remaining ones are skipped, and at width 1 all are. Large clouds first converge with every
-    k-th point.
+    Where a step is below `config.tolerance`, half of the remaining widths of the kernel are skipped,
+    and at its final width all are. Large clouds first converge with every k-th point.
     """
+    widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
+    # Its value is in the weighting; a distance of every pair its own would compile every time.
+    settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
         i, converged = 0, False
         while i < len(widths) and not converged:
-            pairs = tree_pairs(pose, source, reference, stride, both_directions=both_directions)
+            pairs = tree_pairs(
+                pose, source, reference, stride, both_directions=config.both_directions
+            )
             new = _step(
-                pose, source[2:], reference[2:], pairs,
-                weighting.scale, weighting.max_distance, float(widths[i]),
-                kernel=weighting.kernel, trim=weighting.trim, method=method, thickness=thickness,
-                edges=edges,
+                pose, source[2:], reference[2:], pairs, weighting.kernel_scale,
+                weighting.max_correspondence_distance, float(widths[i]), config=settings,
             )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
-            still = _change(pose, new) < tolerance
+            still = _change(pose, new) < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + len(widths)) // 2, len(widths) - 1)
@@ -130,26 +127,22 @@ def _normals(points, neighbors):
     return across, edge_normals(points, neighbors, across)
 
 
-_STATIC = ("kernel", "trim", "method", "thickness", "edges")
-
-
-@partial(jax.jit, static_argnames=_STATIC)
-def _step(
-    pose, source, reference, pairs, scale, max_distance, width, *,
-    kernel, trim, method, thickness, edges,
-):  # fmt: skip
-    (x, *source_surface), (y, *reference_surface) = source, reference
-    weighting = Weighting(kernel, scale, max_distance, trim)
+@partial(jax.jit, static_argnames="config")
+def _step(pose, source, reference, pairs, kernel_scale, max_distance, width, *, config):
+    (x, *source_shape), (y, *reference_shape) = source, reference
+    weighting = Weighting(config.kernel, kernel_scale, max_distance, config.trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
-    if method == "icp":
-        return point_to_point_step(pose, x, y, pairs, weighting, width)
-    if method == "point_to_plane":
-        return point_to_plane_step(pose, x, y, reference_surface[0], pairs, weighting, width)
-    covariances = [
-        surface_covariances(across, thickness, ends if edges else None)
-        for across, ends in (source_surface, reference_surface)
-    ]
-    return gicp_step(pose, x, y, *covariances, pairs, weighting, width, thickness=thickness)
+    surfaces = (_surface(shape, config) for shape in (source_shape, reference_shape))
+    scene, method = Scene(x, y, *surfaces, weighting), method_of(config)
+    return method.step(pose, match(scene, pose, pairs, method, width))
+
+
+def _surface(shape, config):
+    """What the method knows of a surface with these normals and edges."""
+    across, ends = shape
+    if config.method == "gicp":
+        return surface_covariances(across, config.epsilon, ends if config.edges else None)
+    return across
 
 
 def _change(old: RigidTransform, new: RigidTransform) -> float:

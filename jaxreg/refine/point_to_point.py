@@ -4,14 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.procrustes import weighted_procrustes
 from jaxreg.refine.config import RefineConfig
-from jaxreg.refine.correspondences import Pairs, closest_pairs
-from jaxreg.refine.robust import Kernel, Weighting, check_options, pair_weights, widenings
-from jaxreg.types import RigidTransform
-
-_DEFAULT = RefineConfig()
+from jaxreg.refine.correspondences import Pairs
+from jaxreg.refine.cost import Cost, Matched, Method, Scene
+from jaxreg.refine.solve import set_up, solve
+from jaxreg.types import Refinement, RigidTransform
 
 
 def icp(
@@ -21,56 +19,47 @@ def icp(
     initial: RigidTransform | None = None,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
-    iterations: int = _DEFAULT.iterations,
-    max_distance: Float[Array, ""] | float = _DEFAULT.max_distance,
-    trim: float = _DEFAULT.trim,
-    kernel: Kernel = "none",
-    scale: Float[Array, ""] | float | None = None,
-    anneal: float = _DEFAULT.anneal,
-    both_directions: bool = False,
-) -> RigidTransform:
+    config: RefineConfig = RefineConfig(),
+    max_correspondence_distance: Float[Array, ""] | float | None = None,
+    kernel_scale: Float[Array, ""] | float | None = None,
+) -> Refinement:
     """The pose after a fixed number of closest-point iterations from `initial` (the identity).
 
     Every iteration pairs each moved source point with its nearest reference point and solves
-    ``min sum_i w_i |R x_i + t - y_i|^2`` in closed form. ``w_i`` is 1, or the weight of `kernel` at
-    the pair's distance over the width `scale` (None: taken from the distances themselves), which
-    starts `anneal` times wider; 0 beyond `max_distance` and outside the share `trim` of closest
-    pairs. `max_distance` and `scale` have the unit of the clouds. Where no pair is left, the pose
-    stays what it was, so that no overlap gives `initial`.
+    ``min sum_i w_i |R x_i + t - y_i|^2`` in closed form. ``w_i`` is 1, or the weight of the kernel
+    at the pair's distance over its width; 0 beyond the largest distance and outside the trim. Where
+    no pair is left, the pose stays what it was, so that no overlap gives `initial`.
 
-    Differentiable in both clouds through every iteration; which point is nearest is a constant of
-    the derivative, which is exact wherever the pairs do not change.
+    `max_correspondence_distance` and `kernel_scale`, the width of the kernel (None: taken from the
+    distances themselves), have the unit of the clouds, may be traced arrays, and win over `config`.
+
+    Differentiable in both clouds and in `kernel_scale` as `config.gradient` says; which point is
+    nearest is a constant of the derivative, which is exact wherever the pairs do not change.
 
     Raises:
-      ValueError: a shape, the number of iterations, `trim`, `anneal` or `kernel` is wrong.
+      ValueError: a shape or an option is wrong.
     """
-    check_options(iterations=iterations, trim=trim, anneal=anneal)
-    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
-    weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
-
-    def step(pose: RigidTransform, widening: Array):
-        pairs = closest_pairs(
-            rigid.apply(pose, x), y, source_mask, reference_mask, both_directions=both_directions
-        )
-        return point_to_point_step(pose, x, y, pairs, weighting, widening), None
-
-    start = frame.transform_in(where, initial)
-    pose, _ = jax.lax.scan(step, start, widenings(iterations, anneal, x.dtype))
-    return frame.transform_out(where, pose)
+    problem = set_up(
+        source, reference, initial=initial, source_mask=source_mask, reference_mask=reference_mask,
+        config=config, max_correspondence_distance=max_correspondence_distance,
+        kernel_scale=kernel_scale,
+    )  # fmt: skip
+    return solve(problem, POINT_TO_POINT, config=config)
 
 
-def point_to_point_step(
-    pose: RigidTransform,
-    source: Float[Array, "n 3"],
-    reference: Float[Array, "m 3"],
-    pairs: Pairs,
-    weighting: Weighting,
-    widening: Float[Array, ""] | float = 1.0,
-) -> RigidTransform:
-    """The best pose for given pairs, weighted by their distances under the present one."""
-    x, y = source[pairs.source_index], reference[pairs.reference_index]
-    squared = jnp.sum((rigid.apply(pose, x) - y) ** 2, axis=-1)
-    weights = pair_weights(squared, squared, pairs.mask, weighting, widening)
-    solved = weighted_procrustes(x, y, weights)
-    found = jnp.any(weights > 0)
+def point_cost(
+    scene: Scene, pose: RigidTransform, pairs: Pairs, residual: Float[Array, "p 3"]
+) -> Cost:
+    """A residual costs its squared length, ``M_i = I``."""
+    metric = jnp.broadcast_to(jnp.eye(3, dtype=residual.dtype), (*residual.shape, 3))
+    return Cost(metric, jnp.sum(residual**2, axis=-1), pairs.mask)
+
+
+def procrustes_step(pose: RigidTransform, matched: Matched) -> RigidTransform:
+    """The best pose for weighted pairs of points; no pair leaves the pose as it is."""
+    solved = weighted_procrustes(matched.source, matched.target, matched.weights)
+    found = jnp.any(matched.weights > 0)
     return jax.tree.map(lambda new, old: jnp.where(found, new, old), solved, pose)
+
+
+POINT_TO_POINT = Method(point_cost, procrustes_step)

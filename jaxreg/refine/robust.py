@@ -1,14 +1,13 @@
-"""TODO."""
+"""How much a pair counts: robust kernels, their width, the trim and the largest distance."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"]
-
+from jaxreg.refine.config import Kernel
 
 _SMALLEST_SCALE = 1e-3
 """Lower end of a kernel width that is taken from the residuals, in units of the frame: exact copies
@@ -19,14 +18,15 @@ class Weighting(NamedTuple):
     """How the pairs of an iteration are weighted; see `pair_weights`."""
 
     kernel: Kernel
-    scale: Float[Array, ""] | float | None
-    max_distance: Float[Array, ""] | float
+    kernel_scale: Float[Array, ""] | float | None
+    max_correspondence_distance: Float[Array, ""] | float
     trim: float
 
     def in_units_of(self, length: Float[Array, ""] | float) -> "Weighting":
         """The same weighting for clouds divided by `length`."""
-        scale = None if self.scale is None else self.scale / length
-        return self._replace(scale=scale, max_distance=self.max_distance / length)
+        scale = None if self.kernel_scale is None else self.kernel_scale / length
+        distance = self.max_correspondence_distance / length
+        return self._replace(kernel_scale=scale, max_correspondence_distance=distance)
 
 
 def pair_weights(
@@ -38,24 +38,35 @@ def pair_weights(
 ) -> Float[Array, "p"]:
     """How much every pair counts, in [0, 1].
 
-    0 where `mask` is False, where the points are farther apart than `max_distance`, or outside the
-    share `trim` of closest pairs; else the weight of the `kernel` at the residual over its width.
-    The width is `widening` times `scale`; `scale` None takes it from the residuals, 1.4826 times
-    their median, which is the standard deviation of normal ones.
+    0 where `counting_pairs` is False; else the weight of the `kernel` at the residual over its
+    width. The width is `widening` times `kernel_scale`; None takes it from the residuals, 1.4826
+    times their median, which is the standard deviation of normal ones.
     """
-    mask = mask & (squared_distance <= weighting.max_distance**2)
-    if weighting.trim < 1:
-        limit = masked_quantile(squared_distance, mask, weighting.trim)
-        mask = mask & (squared_distance <= limit)
+    mask = counting_pairs(squared_distance, mask, weighting)
     if weighting.kernel == "none":
         return mask.astype(squared_residual.dtype)
-    if weighting.scale is None:
+    if weighting.kernel_scale is None:
         median = masked_quantile(squared_residual, mask, 0.5)
         variance = jnp.maximum(1.4826**2 * median, _SMALLEST_SCALE**2)
     else:
-        variance = weighting.scale**2
+        variance = weighting.kernel_scale**2
     relative = squared_residual / (variance * widening**2)
     return jnp.where(mask, kernel_weight(relative, weighting.kernel), 0)
+
+
+def counting_pairs(
+    squared_distance: Float[Array, "p"], mask: Bool[Array, "p"], weighting: Weighting
+) -> Bool[Array, "p"]:
+    """Which pairs count at all.
+
+    Those of `mask` whose points are at most `max_correspondence_distance` apart; of these the share
+    `trim` of the closest.
+    """
+    mask = mask & (squared_distance <= weighting.max_correspondence_distance**2)
+    if weighting.trim < 1:
+        limit = masked_quantile(squared_distance, mask, weighting.trim)
+        mask = mask & (squared_distance <= limit)
+    return mask
 
 
 def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
@@ -82,9 +93,18 @@ def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
     )
 
 
-def widenings(iterations: int, anneal: float, dtype: jnp.dtype) -> Float[np.ndarray, "iterations"]:
-    """How much wider than its final width the kernel is: from `anneal` to 1 by equal factors."""
-    return np.geomspace(anneal, 1, iterations).astype(dtype)
+def widenings(
+    iterations: int, annealing: float, dtype: jnp.dtype
+) -> Float[np.ndarray, "iterations"]:
+    """How much wider than its final width the kernel is: from `annealing` to 1 by equal factors.
+
+    A single iteration has the final width.
+    """
+    return (
+        np.geomspace(annealing, 1, iterations).astype(dtype)
+        if iterations > 1
+        else np.ones(1, dtype)
+    )
 
 
 def masked_quantile(
@@ -112,13 +132,3 @@ def masked_quantile(
     # The nearest one, since XLA may have computed the values anew, to another last bit.
     apart = jnp.maximum(bits, found) - jnp.minimum(bits, found)
     return jnp.where(count > 0, values[jnp.argmin(apart)], 0)
-
-
-def check_options(*, iterations: int, trim: float, anneal: float) -> None:
-    """Raises ValueError unless ``iterations >= 1``, ``0 < trim <= 1`` and ``anneal >= 1``."""
-    if iterations < 1:
-        raise ValueError(f"iterations = {iterations}: choose at least 1.")
-    if not 0 < trim <= 1:
-        raise ValueError(f"trim = {trim} is no share of the pairs: choose 0 < trim <= 1.")
-    if not anneal >= 1:
-        raise ValueError(f"anneal = {anneal} would narrow the first kernel: choose 1 or more.")

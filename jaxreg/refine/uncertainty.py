@@ -16,12 +16,16 @@ from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs, closest_pairs
+from jaxreg.refine.cost import Scene, match
 from jaxreg.refine.gauss_newton import normal_equations
-from jaxreg.refine.point_to_plane import plane_metric
-from jaxreg.refine.robust import Kernel, Weighting
+from jaxreg.refine.point_to_plane import POINT_TO_PLANE
+from jaxreg.refine.robust import Weighting
+from jaxreg.refine.solve import set_up
 from jaxreg.types import RigidTransform
 
-_DEFAULT = RefineConfig()
+WEAK = 0.01
+"""A motion is weak when it changes the distances to the surfaces by a smaller mean square than this,
+for a motion of one (1/3 for surfaces that face all ways)."""
 _SMALLEST_EIGENVALUE = 1e-6
 """Of the information matrix, relative to its largest: what is below counts as this much, so that a
 free motion has a huge variance instead of an infinite one."""
@@ -76,11 +80,9 @@ def pose_uncertainty(
     reference_normals: Float[Array, "m 3"] | None = None,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
-    max_distance: Float[Array, ""] | float = _DEFAULT.max_distance,
-    trim: float = _DEFAULT.trim,
-    kernel: Kernel = _DEFAULT.kernel,
-    scale: Float[Array, ""] | float | None = None,
-    neighbors: int = _DEFAULT.neighbors,
+    config: RefineConfig = RefineConfig(),
+    max_correspondence_distance: Float[Array, ""] | float | None = None,
+    kernel_scale: Float[Array, ""] | float | None = None,
 ) -> PoseUncertainty:
     """Information and covariance of a pose, from nearest pairs; options as for `point_to_plane`.
 
@@ -89,15 +91,20 @@ def pose_uncertainty(
     and `length` is zero; `weight` tells.
 
     Raises:
-      ValueError: a shape is wrong, or the reference has not more than `neighbors` points.
+      ValueError: a shape or an option is wrong, or the reference has not more than `config.k`
+        points.
     """
-    where, x, y = frame.enter(source, reference, source_mask, reference_mask)
+    where, start, scene, *_ = set_up(
+        source, reference, initial=transform, source_mask=source_mask,
+        reference_mask=reference_mask, config=config,
+        max_correspondence_distance=max_correspondence_distance, kernel_scale=kernel_scale,
+    )  # fmt: skip
+    y = scene.reference
     if reference_normals is None:
-        reference_normals = normals(y, knn(y, neighbors, reference_mask), reference_mask)
-    moved = rigid.apply(frame.transform_in(where, transform), x)
+        reference_normals = normals(y, knn(y, config.k, reference_mask), reference_mask)
+    moved = rigid.apply(start, scene.source)
     pairs = closest_pairs(moved, y, source_mask, reference_mask, both_directions=False)
-    weighting = Weighting(kernel, scale, max_distance, trim).in_units_of(where.length)
-    return uncertainty_of_pairs(where, moved, y, reference_normals, pairs, weighting)
+    return uncertainty_of_pairs(where, moved, y, reference_normals, pairs, scene.weighting)
 
 
 def about(uncertainty: PoseUncertainty, centre: Float[np.ndarray, "3"]) -> PoseUncertainty:
@@ -125,15 +132,13 @@ def uncertainty_of_pairs(
     weighting: Weighting,
 ) -> PoseUncertainty:
     """`pose_uncertainty` of given pairs of clouds in the frame."""
-    x, y = moved[pairs.source_index], reference[pairs.reference_index]
-    metric = plane_metric(x, y, reference_normals, pairs, weighting)
-    information, _ = normal_equations(x, y, metric)
-    weight = jnp.sum(jnp.trace(metric, axis1=1, axis2=2))
-    residual = x - y
-    squared = jnp.sum(metric * residual[:, :, None] * residual[:, None, :])
+    scene = Scene(moved, reference, None, reference_normals, weighting)
+    matched = match(scene, rigid.identity(moved.dtype), pairs, POINT_TO_PLANE)
+    information, _ = normal_equations(matched.moved, matched.target, matched.metric)
+    weight = jnp.sum(matched.weights)
     # Six parameters were fitted; fewer weights than that determine nothing.
-    variance = squared / jnp.maximum(weight - 6, 1)
-    units = jnp.concatenate([jnp.ones(3, x.dtype), jnp.full(3, where.length)])
+    variance = jnp.sum(matched.weights * matched.squared) / jnp.maximum(weight - 6, 1)
+    units = jnp.concatenate([jnp.ones(3, moved.dtype), jnp.full(3, where.length)])
     scaling = units[:, None] * units[None, :]
     return PoseUncertainty(
         information=information / scaling * where.length**2,
@@ -146,7 +151,7 @@ def uncertainty_of_pairs(
 
 
 def weak_directions(
-    uncertainty: PoseUncertainty, *, threshold: float = _DEFAULT.weak_threshold
+    uncertainty: PoseUncertainty, *, threshold: float = WEAK
 ) -> tuple[WeakDirection, ...]:
     """The translations and rotations whose `strength` is below `threshold`, weakest first (host).
 

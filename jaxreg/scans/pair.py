@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from jaxreg import _xla
 from jaxreg.geometry import clouds, frame
-from jaxreg.refine.host import Refined
-from jaxreg.refine.host import refine as refine_pose
+from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.host import Refined, refine_on_host
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
 from jaxreg.refine.uncertainty import PoseUncertainty, about, weak_directions
 from jaxreg.scans import prepare, verdict
@@ -112,7 +112,7 @@ def register(
 
 
 def _indexed(points: np.ndarray, config: RegisterConfig) -> IndexedCloud:
-    return index_cloud(_enough(points, config), neighbors=config.refine_neighbors)
+    return index_cloud(_enough(points, config), k=config.refine_neighbors)
 
 
 def _enough(points: np.ndarray, config: RegisterConfig) -> np.ndarray:
@@ -236,20 +236,17 @@ def _refined(x, y, pose, method: Refinement | None, spacing: float, config) -> R
         return Refined(RigidTransform(rotation, pose.translation), 0, None, _UNREFINED)
     x, y = (_enough(prepare.reduce_to(p, config.refine_points), config) for p in (x, y))
     finer = min(spacing, max(prepare.spacing(x), prepare.spacing(y), prepare.FINEST))
-    return refine_pose(
-        x,
-        y,
+    settings = RefineConfig(
         method=method,
-        initial=pose,
         iterations=config.refine_iterations,
-        max_distance=config.refine_reach * finer,
-        anneal=config.refine_anneal,
+        max_correspondence_distance=config.refine_reach * finer,
+        kernel_annealing=config.refine_anneal,
         both_directions=True,
-        neighbors=config.refine_neighbors,
-        thickness=config.refine_thickness,
+        k=config.refine_neighbors,
+        epsilon=config.refine_thickness,
         edges=config.refine_edges,
-        dense_limit=0,
     )
+    return refine_on_host(x, y, initial=pose, config=settings)
 
 
 def _result(

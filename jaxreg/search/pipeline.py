@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import frame, rigid
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.gicp import gicp
 from jaxreg.search.alignment import FINE_EPSILON, align_coarse, align_fine
 from jaxreg.search.candidates import MATCHES, select_candidates
@@ -118,15 +119,17 @@ def register_global(
         initial=start,
         source_mask=source_mask,
         reference_mask=reference_mask,
-        iterations=15,
-        max_distance=_FINAL_REACH * sparsity,
-        anneal=8.0,
-        both_directions=True,
-        neighbors=min(16, min(len(x), len(y)) - 1),
-        thickness=FINE_EPSILON,
-        partners=2,
-        edges=True,
-    )
+        config=RefineConfig(
+            iterations=15,
+            kernel_annealing=8.0,
+            both_directions=True,
+            k=min(16, min(len(x), len(y)) - 1),
+            epsilon=FINE_EPSILON,
+            correspondences_per_point=2,
+            edges=True,
+        ),
+        max_correspondence_distance=_FINAL_REACH * sparsity,
+    ).transform
     return _registration(
         where, pose, (x, y), (described[0].mask, described[1].mask), found.score[0]
     )

@@ -13,7 +13,7 @@ IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 def indexed(source, reference):
     x, y, spacing = prepare.at_one_density(source, reference, 512)
-    return index_cloud(x, neighbors=10), index_cloud(y, neighbors=10), spacing
+    return index_cloud(x, k=10), index_cloud(y, k=10), spacing
 
 
 @pytest.fixture(scope="module")
