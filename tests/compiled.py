@@ -10,8 +10,10 @@ from jaxreg.geometry import neighbors
 from jaxreg.geometry import normals as _normals
 from jaxreg.refine import correspondences
 from jaxreg.refine import gicp as _gicp
+from jaxreg.refine import methods as _methods
 from jaxreg.refine import point_to_plane as _point_to_plane
 from jaxreg.refine import point_to_point as _icp
+from jaxreg.refine import uncertainty as _uncertainty
 from jaxreg.search import descriptors
 
 AS_USERS = {"xla_backend_optimization_level": 3}
@@ -19,18 +21,16 @@ AS_USERS = {"xla_backend_optimization_level": 3}
 if jax.__version_info__ < (0, 11):
     AS_USERS["xla_cpu_use_fusion_emitters"] = True
 
-_SOLVER = ("iterations", "kernel", "trim", "anneal", "both_directions")
-
 knn = jax.jit(neighbors.knn, static_argnums=1)
 closest_pairs = jax.jit(correspondences.closest_pairs, static_argnames="both_directions")
 normals = jax.jit(_normals.normals)
 edge_normals = jax.jit(_normals.edge_normals)
 neighborhood_covariances = jax.jit(_normals.neighborhood_covariances)
-icp = jax.jit(_icp.icp, static_argnames=_SOLVER)
-point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames=(*_SOLVER, "neighbors"))
-gicp = jax.jit(
-    _gicp.gicp, static_argnames=(*_SOLVER, "neighbors", "thickness", "partners", "edges")
-)
+icp = jax.jit(_icp.icp, static_argnames="config")
+point_to_plane = jax.jit(_point_to_plane.point_to_plane, static_argnames="config")
+gicp = jax.jit(_gicp.gicp, static_argnames="config")
+refine = jax.jit(_methods.refine, static_argnames="config")
+pose_uncertainty = jax.jit(_uncertainty.pose_uncertainty, static_argnames="config")
 gaussian_normals = jax.jit(descriptors.gaussian_normals, static_argnames="radius")
 moments = jax.jit(descriptors.moments, static_argnames="radii")
 mean_spacing = jax.jit(descriptors.mean_spacing)

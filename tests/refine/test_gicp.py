@@ -1,5 +1,7 @@
 """Generalised ICP against a general minimiser, small_gicp and Open3D."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from jaxreg.refine.config import RefineConfig
 from tests.compiled import gicp, icp, point_to_plane
 
 
@@ -27,18 +30,19 @@ def make_pair(seed, n=600, noise=0.002):
     return sample(), sample() @ rotation.T + translation
 
 
-def covariances_by_loop(points, k, thickness):
+def covariances_by_loop(points, k, epsilon):
     index = cKDTree(points).query(points, k=k + 1)[1]
     result = []
     for row in index:
         _, axes = np.linalg.eigh(np.cov(points[row].T))
-        result.append(axes @ np.diag([thickness, 1, 1]) @ axes.T)
+        result.append(axes @ np.diag([epsilon, 1, 1]) @ axes.T)
     return np.stack(result)
 
 
 def test_fixed_point_minimises_the_mahalanobis_distances(seed):
     source, reference = make_pair(seed, n=150)
-    pose = gicp(jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=80)
+    config = RefineConfig(kernel="none", iterations=80)
+    pose = gicp(jnp.asarray(source), jnp.asarray(reference), config=config)
     rotation, translation = np.asarray(pose.rotation), np.asarray(pose.translation)
     moved = source @ rotation.T + translation
     index = cKDTree(reference).query(moved)[1]
@@ -59,11 +63,18 @@ def test_edges_stop_a_plate_from_sliding(seed):
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, 1, (2, 8, 400, 3)) * [1, 1, 0]
     offset = np.array([0.03, -0.02, 0.01])
-    options = {"both_directions": True, "max_distance": 0.06, "thickness": 0.01, "neighbors": 16}
-    options |= {"partners": 2, "iterations": 10}
+    config = RefineConfig(
+        iterations=10,
+        max_correspondence_distance=0.06,
+        both_directions=True,
+        k=16,
+        epsilon=0.01,
+        correspondences_per_point=2,
+    )
 
     def slides(edges):
-        one = lambda pair: gicp(*pair, edges=edges, **options)  # noqa: E731
+        with_edges = dataclasses.replace(config, edges=edges)
+        one = lambda pair: gicp(*pair, config=with_edges).transform  # noqa: E731
         pose = jax.lax.map(one, (jnp.asarray(x + offset), jnp.asarray(y)))
         centre = x.mean(axis=1) + offset
         rotation, translation = map(np.asarray, pose)
@@ -79,20 +90,27 @@ def test_given_covariances_need_no_neighbours():
     pose = gicp(x, x, source_covariances=planes, reference_covariances=planes)
     np.testing.assert_allclose(pose.rotation, np.eye(3), atol=1e-12)
     with pytest.raises(ValueError, match="k = 10 neighbours do not exist"):
-        gicp(x, x, source_covariances=planes, reference_covariances=planes, partners=2)
+        gicp(
+            x,
+            x,
+            source_covariances=planes,
+            reference_covariances=planes,
+            config=RefineConfig(correspondences_per_point=2),
+        )
 
 
 @pytest.mark.parametrize("partners", [0, 12])
-def test_partners_that_are_no_neighbours_are_refused(partners):
+def test_partners_that_are_not_neighbours_are_refused(partners):
     x = jnp.zeros((20, 3))
-    with pytest.raises(ValueError, match=f"partners = {partners}: choose 1 to neighbors"):
-        gicp(x, x, partners=partners)
+    message = f"correspondences_per_point = {partners}: choose 1 to k \\+ 1 = 11"
+    with pytest.raises(ValueError, match=message):
+        gicp(x, x, config=RefineConfig(correspondences_per_point=partners))
 
 
 def test_isotropic_covariances_make_it_point_to_point(seed):
     source, reference = make_pair(seed, n=150)
     identity = jnp.tile(jnp.eye(3), (150, 1, 1))
-    options = {"kernel": "none", "iterations": 150}
+    options = {"config": RefineConfig(kernel="none", iterations=150)}
     x, y = jnp.asarray(source), jnp.asarray(reference)
     pose = gicp(x, y, source_covariances=identity, reference_covariances=identity, **options)
     expected = icp(x, y, **options)
@@ -119,7 +137,8 @@ def test_agrees_with_small_gicp(number, seed):
         max_correspondence_distance=10.0, max_iterations=200,
         rotation_epsilon=1e-8, translation_epsilon=1e-8,
     )  # fmt: skip
-    pose = gicp(jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=60)
+    config = RefineConfig(kernel="none", iterations=60)
+    pose = gicp(jnp.asarray(source), jnp.asarray(reference), config=config)
     assert_agree(pose, theirs.T_target_source, extent=2.0)
 
 
@@ -143,5 +162,6 @@ def test_agrees_with_open3d(method, seed):
         *clouds, 10.0, np.eye(4), estimation,
         registration.ICPConvergenceCriteria(1e-12, 1e-12, 300),
     )  # fmt: skip
-    pose = solve(jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=150)
+    config = RefineConfig(kernel="none", iterations=150)
+    pose = solve(jnp.asarray(source), jnp.asarray(reference), config=config)
     assert_agree(pose, theirs.transformation, extent=2.0)

@@ -6,6 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from jaxreg.refine.config import RefineConfig
 from tests.compiled import point_to_plane
 
 
@@ -26,7 +27,7 @@ def test_fixed_point_is_the_least_squares_solution(seed):
     source = (source + 0.01 * rng.normal(size=source.shape)) @ turned.T + 0.02
     pose = point_to_plane(
         jnp.asarray(source), jnp.asarray(reference), reference_normals=jnp.asarray(normal),
-        kernel="none", iterations=60,
+        config=RefineConfig(kernel="none", iterations=60),
     )  # fmt: skip
     rotation, translation = np.asarray(pose.rotation), np.asarray(pose.translation)
     index = cKDTree(reference).query(source @ rotation.T + translation)[1]
@@ -49,7 +50,8 @@ def test_zero_normals_count_for_nothing(seed):
     # The dropped points keep their places, so that the pairs stay; only their planes are gone.
     poses = [
         point_to_plane(
-            jnp.asarray(source), jnp.asarray(reference), kernel="none", iterations=1,
+            jnp.asarray(source), jnp.asarray(reference),
+            config=RefineConfig(kernel="none", iterations=1),
             reference_normals=jnp.asarray(np.where(dropped[:, None], 0, n)),
         )
         for n in (normal, np.where(dropped[:, None], far, normal))

@@ -1,5 +1,7 @@
 """Point-to-point ICP against a scipy loop, its laws, derivatives and degenerate inputs."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import rigid
 from jaxreg.geometry.frame import check_clouds
+from jaxreg.refine.config import RefineConfig
 from jaxreg.types import RigidTransform
 from tests.compiled import icp
+
+plain = partial(RefineConfig, kernel="none")
 
 
 def make_pair(seed, n=80, m=None, angle_deg=8.0, noise=0.0):
@@ -35,13 +40,13 @@ def angle_deg(a, b):
     return np.rad2deg(Rotation.from_matrix(np.asarray(a) @ np.asarray(b).T).magnitude())
 
 
-def icp_by_loop(source, reference, iterations, max_distance=np.inf, trim=1.0):
+def icp_by_loop(source, reference, iterations, max_correspondence_distance=np.inf, trim=1.0):
     """The textbook: a k-d tree and scipy's solution of Wahba's problem."""
     rotation, translation = np.eye(3), np.zeros(3)
     tree = cKDTree(reference)
     for _ in range(iterations):
         distance, index = tree.query(source @ rotation.T + translation)
-        kept = distance <= max_distance
+        kept = distance <= max_correspondence_distance
         kept &= distance <= np.sort(distance[kept])[int(np.ceil(trim * kept.sum())) - 1]
         x, y = source[kept], reference[index[kept]]
         centre_x, centre_y = x.mean(0), y.mean(0)
@@ -50,10 +55,10 @@ def icp_by_loop(source, reference, iterations, max_distance=np.inf, trim=1.0):
     return rotation, translation
 
 
-@pytest.mark.parametrize("options", [{}, {"max_distance": 0.4}, {"trim": 0.7}])
+@pytest.mark.parametrize("options", [{}, {"max_correspondence_distance": 0.4}, {"trim": 0.7}])
 def test_equals_the_loop(options):
     source, reference, _ = make_pair(1, noise=0.02, m=110)
-    result = icp(jnp.asarray(source), jnp.asarray(reference), iterations=4, **options)
+    result = icp(jnp.asarray(source), jnp.asarray(reference), config=plain(iterations=4, **options))
     rotation, translation = icp_by_loop(source, reference, 4, **options)
     np.testing.assert_allclose(result.rotation, rotation, atol=1e-9)
     np.testing.assert_allclose(result.translation, translation, atol=1e-9)
@@ -62,7 +67,7 @@ def test_equals_the_loop(options):
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "gaussian"])
 def test_recovers_a_known_motion(kernel):
     source, reference, truth = make_pair(2)
-    result = icp(jnp.asarray(source), jnp.asarray(reference), iterations=30, kernel=kernel)
+    result = icp(jnp.asarray(source), jnp.asarray(reference), config=plain(kernel=kernel))
     assert angle_deg(result.rotation, truth.rotation) < 1e-6
     np.testing.assert_allclose(result.translation, truth.translation, atol=1e-8)
 
@@ -70,19 +75,18 @@ def test_recovers_a_known_motion(kernel):
 def test_robust_weights_ignore_what_has_no_partner():
     source, reference, truth = make_pair(3, n=200, angle_deg=4.0)
     kept = source[:, 0] < 0.6
-    result = icp(
-        jnp.asarray(source), jnp.asarray(reference[reference[:, 0] < 0.6]), kernel="geman_mcclure"
-    )
-    plain = icp(jnp.asarray(source), jnp.asarray(reference[reference[:, 0] < 0.6]))
+    clouds = jnp.asarray(source), jnp.asarray(reference[reference[:, 0] < 0.6])
+    result = icp(*clouds, config=plain(kernel="geman_mcclure"))
+    least_squares = icp(*clouds, config=plain())
     assert kept.mean() < 0.8
     assert angle_deg(result.rotation, truth.rotation) < 1e-2
-    assert angle_deg(plain.rotation, truth.rotation) > 0.1
+    assert angle_deg(least_squares.rotation, truth.rotation) > 0.1
 
 
 def test_copies_give_the_identity_in_single_precision():
     source, _, _ = make_pair(4)
     points = jnp.asarray(source, jnp.float32)
-    result = icp(points, points)
+    result = icp(points, points, config=plain())
     assert result.rotation.dtype == jnp.float32
     np.testing.assert_allclose(result.rotation, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(result.translation, 0, atol=1e-6)
@@ -94,13 +98,14 @@ def test_common_motion_conjugates_the_result():
         jnp.asarray(Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()),
         jnp.array([3.0, -2.0, 5.0]),
     )
-    result = icp(jnp.asarray(source), jnp.asarray(reference))
-    expected = rigid.compose(rigid.compose(motion, result), rigid.inverse(motion))
+    result = icp(jnp.asarray(source), jnp.asarray(reference), config=plain())
+    expected = rigid.compose(rigid.compose(motion, result.transform), rigid.inverse(motion))
     start = rigid.compose(motion, rigid.inverse(motion))
     moved = icp(
         rigid.apply(motion, jnp.asarray(source)),
         rigid.apply(motion, jnp.asarray(reference)),
         initial=start,
+        config=plain(),
     )
     np.testing.assert_allclose(moved.rotation, expected.rotation, atol=1e-9)
     np.testing.assert_allclose(moved.translation, expected.translation, atol=1e-8)
@@ -108,8 +113,9 @@ def test_common_motion_conjugates_the_result():
 
 def test_swapped_clouds_give_the_inverse():
     source, reference, _ = make_pair(6, noise=0.02)
-    a = icp(jnp.asarray(source), jnp.asarray(reference), both_directions=True)
-    b = icp(jnp.asarray(reference), jnp.asarray(source), both_directions=True)
+    config = plain(both_directions=True)
+    a = icp(jnp.asarray(source), jnp.asarray(reference), config=config).transform
+    b = icp(jnp.asarray(reference), jnp.asarray(source), config=config)
     np.testing.assert_allclose(b.rotation, rigid.inverse(a).rotation, atol=1e-9)
     np.testing.assert_allclose(b.translation, rigid.inverse(a).translation, atol=1e-9)
 
@@ -117,7 +123,9 @@ def test_swapped_clouds_give_the_inverse():
 def test_initial_pose_is_used():
     source, reference, truth = make_pair(7, angle_deg=170.0)
     start = RigidTransform(jnp.asarray(truth.rotation), jnp.asarray(truth.translation))
-    result = icp(jnp.asarray(source), jnp.asarray(reference), initial=start, iterations=1)
+    result = icp(
+        jnp.asarray(source), jnp.asarray(reference), initial=start, config=plain(iterations=1)
+    )
     np.testing.assert_allclose(result.rotation, truth.rotation, atol=1e-9)
 
 
@@ -125,26 +133,26 @@ def test_initial_pose_is_used():
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_scale_of_the_clouds_does_not_matter(dtype, factor):
     source, reference, _ = make_pair(8, noise=0.02)
-    options = {"iterations": 10, "kernel": "cauchy"}
+    options = {"config": plain(iterations=10, kernel="cauchy")}
     x, y = jnp.asarray(source, dtype), jnp.asarray(reference, dtype)
-    plain, scaled = icp(x, y, **options), icp(x * factor, y * factor, **options)
+    unscaled, scaled = icp(x, y, **options), icp(x * factor, y * factor, **options)
     tolerance = 2e-5 if dtype == jnp.float32 else 1e-9
-    np.testing.assert_allclose(scaled.rotation, plain.rotation, atol=tolerance)
-    np.testing.assert_allclose(scaled.translation / factor, plain.translation, atol=tolerance)
+    np.testing.assert_allclose(scaled.rotation, unscaled.rotation, atol=tolerance)
+    np.testing.assert_allclose(scaled.translation / factor, unscaled.translation, atol=tolerance)
 
 
 def test_offset_does_not_matter():
     source, reference, _ = make_pair(9, noise=0.02)
-    plain = icp(jnp.asarray(source), jnp.asarray(reference))
+    still = icp(jnp.asarray(source), jnp.asarray(reference), config=plain())
     shift = np.array([1e6, -2e6, 5e5])
-    moved = icp(jnp.asarray(source + shift), jnp.asarray(reference + shift))
-    expected = shift + plain.translation - plain.rotation @ shift
-    np.testing.assert_allclose(moved.rotation, plain.rotation, atol=1e-8)
+    moved = icp(jnp.asarray(source + shift), jnp.asarray(reference + shift), config=plain())
+    expected = shift + still.translation - still.rotation @ shift
+    np.testing.assert_allclose(moved.rotation, still.rotation, atol=1e-8)
     np.testing.assert_allclose(moved.translation, expected, atol=1e-2)
 
 
 def pose_sum(source, reference, options, **masks):
-    result = icp(source, reference, **options, **masks)
+    result = icp(source, reference, config=plain(**options), **masks)
     probe = jnp.linspace(-1.0, 2.0, 9, dtype=source.dtype).reshape(3, 3)
     return jnp.sum(result.rotation * probe) + jnp.sum(result.translation * probe[0])
 
@@ -181,7 +189,7 @@ def test_finite_at_degenerate_clouds(kernel):
 
     def solve(cloud, mask):
         masks = {"source_mask": mask, "reference_mask": mask}
-        pose = icp(cloud, cloud + 0.01, **options, **masks)
+        pose = icp(cloud, cloud + 0.01, config=plain(**options), **masks)
         return pose, jax.grad(pose_sum, (0, 1))(cloud, cloud + 0.01, options, **masks)
 
     pose, gradients = jax.jit(jax.vmap(solve))(points, mask)
@@ -192,9 +200,9 @@ def test_finite_at_degenerate_clouds(kernel):
 @pytest.mark.parametrize("kernel", ["none", "cauchy"])
 def test_no_overlap_keeps_the_initial_pose(kernel):
     source, _, _ = make_pair(11)
-    options = {"max_distance": 0.1, "kernel": kernel}
+    options = {"max_correspondence_distance": 0.1, "kernel": kernel}
     far = jnp.asarray(source + 100)
-    result = icp(jnp.asarray(source), far, **options)
+    result = icp(jnp.asarray(source), far, config=plain(**options))
     np.testing.assert_allclose(result.rotation, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(result.translation, 0, atol=1e-12)
     differentiate = jax.jit(jax.grad(lambda x, y: pose_sum(x, y, options), (0, 1)))
@@ -228,7 +236,8 @@ def test_padding_changes_nothing(both_directions):
 def test_nothing_valid_gives_the_initial_pose():
     points = jnp.full((4, 3), jnp.nan)
     nothing = jnp.zeros(4, bool)
-    result = icp(points, points, source_mask=nothing, reference_mask=nothing, kernel="huber")
+    config = plain(kernel="huber")
+    result = icp(points, points, source_mask=nothing, reference_mask=nothing, config=config)
     np.testing.assert_array_equal(result.rotation, np.eye(3))
     np.testing.assert_array_equal(result.translation, np.zeros(3))
 
@@ -236,7 +245,7 @@ def test_nothing_valid_gives_the_initial_pose():
 def test_jit_and_vmap_equal_eager():
     pairs = [make_pair(seed, n=20, noise=0.02)[:2] for seed in (13, 14, 15)]
     x, y = (jnp.asarray(np.stack(clouds)) for clouds in zip(*pairs, strict=True))
-    options = {"iterations": 3, "kernel": "cauchy"}
+    options = {"config": plain(iterations=3, kernel="cauchy")}
     batch = jax.jit(jax.vmap(lambda a, b: icp(a, b, **options)))(x, y)
     for i in range(3):
         with jax.disable_jit():
@@ -250,7 +259,7 @@ def test_jit_and_vmap_equal_eager():
 )
 def test_wrong_options_are_named(options, message):
     with pytest.raises(ValueError, match=message):
-        icp(jnp.zeros((5, 3)), jnp.zeros((5, 3)), **options)
+        icp(jnp.zeros((5, 3)), jnp.zeros((5, 3)), config=plain(**options))
 
 
 @pytest.mark.parametrize("shape", [(2, 5, 3), (0, 3), (5, 2), (3,)])

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import rigid
 from jaxreg.refine import uncertainty as rooms
+from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.point_to_plane import point_to_plane
 from jaxreg.refine.uncertainty import weak_directions
 from jaxreg.types import RigidTransform
+from tests.compiled import pose_uncertainty
 
-pose_uncertainty = jax.jit(rooms.pose_uncertainty, static_argnames=("kernel", "trim", "neighbors"))
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 
 
@@ -102,10 +103,10 @@ def test_covariance_is_that_of_repeated_measurements(seed):
     normal = jnp.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
     reference, sigma = jnp.asarray(points), 1e-3
     noise = sigma * rng.normal(size=(300, 150, 3))
-    options = {"kernel": "none", "reference_normals": normal}
+    options = {"config": RefineConfig(kernel="none", iterations=4), "reference_normals": normal}
 
     def measure(noise):
-        pose = point_to_plane(reference + noise, reference, iterations=4, **options)
+        pose = point_to_plane(reference + noise, reference, **options).transform
         uncertainty = pose_uncertainty(pose, reference + noise, reference, **options)
         return pose, uncertainty
 
@@ -128,7 +129,7 @@ def test_covariance_is_that_of_repeated_measurements(seed):
 def test_finite_without_pairs_and_without_normals():
     line = jnp.linspace(0, 1, 20)[:, None] * jnp.array([[1.0, 2, 3]])
     identity = rigid.identity(line.dtype)
-    far = pose_uncertainty(identity, line, line + 100, max_distance=0.1)
+    far = pose_uncertainty(identity, line, line + 100, max_correspondence_distance=0.1)
     assert far.weight == 0
     assert weak_directions(far) == ()
     for uncertainty in (far, pose_uncertainty(identity, line, line)):

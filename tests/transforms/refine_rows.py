@@ -8,12 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import frame, normals
 from jaxreg.refine import (
+    config,
     correspondences,
+    cost,
     gauss_newton,
     gicp,
+    methods,
     point_to_plane,
     point_to_point,
     robust,
+    solve,
     uncertainty,
 )
 from jaxreg.types import RigidTransform
@@ -77,6 +81,10 @@ def small_parts() -> dict[str, Row]:
             (pose(), RNG.normal(size=3), RNG.normal(size=3)),
             ((IDENTITY, zero, zero), (nowhere(), zero, zero)),
         ),
+        # Its value is zero.
+        "refine.gauss_newton.perturbation": Row(
+            gauss_newton.perturbation, (pose(),), ((IDENTITY,), (nowhere(),)), smooth=False
+        ),
         "refine.gauss_newton.rotation_from_vector": Row(
             gauss_newton.rotation_from_vector,
             (RNG.normal(size=3),),
@@ -120,6 +128,10 @@ def small_parts() -> dict[str, Row]:
             (RNG.uniform(size=N), RNG.uniform(size=N), pairs(), np.float64(0.5)),
             ((np.zeros(N), np.zeros(N), none(pairs()), np.float64(0.5)),),
         ),
+        "refine.robust.counting_pairs": Row(
+            lambda d, these: robust.counting_pairs(d, these.mask, WIDE._replace(trim=0.7)),
+            (RNG.uniform(size=N), pairs()),
+        ),
         "refine.robust.kernel_weight": Row(
             lambda x: [robust.kernel_weight(x, k) for k in ("huber", "cauchy", "gaussian")],
             (RNG.uniform(0.1, 3, N),),
@@ -134,52 +146,122 @@ def small_parts() -> dict[str, Row]:
     }
 
 
+def scene(x, y, of_source=None, of_reference=None):
+    return cost.Scene(x, y, of_source, of_reference, WIDE)
+
+
+def matched(method):
+    """`match` of given pairs, as a function of pose, clouds and what is known of the surfaces."""
+
+    def function(pose, x, y, *surfaces_and_pairs):
+        *surfaces, these = surfaces_and_pairs
+        return cost.match(scene(x, y, *surfaces), pose, these, method, 2.0)
+
+    return function
+
+
+def cost_of(function):
+    def of_residuals(pose, x, y, *surfaces_and_pairs):
+        *surfaces, these = surfaces_and_pairs
+        return function(scene(x, y, *surfaces), pose, these, x - y[::-1])
+
+    return of_residuals
+
+
+def entered_problem(x, y):
+    where, start, clouds, *_ = problem(x, y)
+    return where, start, clouds.source, clouds.reference
+
+
+def problem(x, y):
+    options = {"initial": None, "source_mask": None, "reference_mask": None}
+    options |= {"max_correspondence_distance": None, "kernel_scale": 0.5}
+    return solve.set_up(x, y, config=FEW, **options)
+
+
+def fixed_point(pose, x, y, across):
+    these = problem(x, y)
+    these = these._replace(scene=these.scene._replace(reference_surface=across))
+    return solve.at_fixed_point(these, point_to_plane.POINT_TO_PLANE, pose, config=FEW)
+
+
+FEW = config.RefineConfig(iterations=2, k=4)
+SOLUTION = config.RefineConfig("gicp", iterations=12, k=4, gradient="implicit")
+"""Its derivative is that of the solution: enough iterations to be there."""
+
+
 def steps_and_loops() -> dict[str, Row]:
     x = points()
     y, tilted, flat = moved_a_little(x), points(), definite()
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
-    few = {"iterations": 2, "kernel": "geman_mcclure", "scale": 0.5}
-    near = {**few, "neighbors": 4}
-    from_gicp = functools.partial(gicp.gicp_step, weighting=WIDE, thickness=0.01)
-    uncertain = functools.partial(uncertainty.pose_uncertainty, kernel="cauchy", scale=0.5)
+    few, solution = ({"config": c, "kernel_scale": 0.5} for c in (FEW, SOLUTION))
     same = every(lambda x: (x, x))
     at_identity = every(lambda x: (IDENTITY, x, x, pairs()))
     frames = frame.Frame(np.zeros(3), np.zeros(3), np.float64(1.0))
+    generalized = gicp.generalized(config.RefineConfig(epsilon=0.01))
+    counts, weights = np.ones(N, bool), RNG.uniform(0.5, 1, N)
+    weighed = cost.Matched(x, x, y, definite(), RNG.uniform(size=N), weights, counts)
+    nothing = weighed._replace(weights=0 * weighed.weights, metric=0 * weighed.metric)
+    turned = RigidTransform(Rotation.from_rotvec([0.02, 0.01, 0.03]).as_matrix(), np.full(3, 0.01))
     return {
         "refine.gauss_newton.gauss_newton_step": Row(
             gauss_newton.gauss_newton_step,
             (pose(), x, y, definite()),
             ((IDENTITY, x, x, np.zeros((N, 3, 3))), (IDENTITY, 0 * x, 0 * x, flat)),
         ),
-        "refine.point_to_point.point_to_point_step": Row(
-            functools.partial(point_to_point.point_to_point_step, weighting=WIDE),
+        "refine.cost.match": Row(
+            matched(point_to_point.POINT_TO_POINT),
             (IDENTITY, x, y, pairs()),
             (*at_identity, (pose(), x, y, none(pairs()))),
         ),
+        "refine.cost.lower_by_gauss_newton": Row(
+            cost.lower_by_gauss_newton, (IDENTITY, weighed), ((pose(), nothing),)
+        ),
+        "refine.point_to_point.point_cost": Row(
+            cost_of(point_to_point.point_cost), (IDENTITY, x, y, pairs()), at_identity
+        ),
+        "refine.point_to_point.procrustes_step": Row(
+            point_to_point.procrustes_step, (IDENTITY, weighed), ((pose(), nothing),)
+        ),
         "refine.point_to_point.icp": Row(
-            functools.partial(point_to_point.icp, **few), (x, y), same
+            functools.partial(point_to_point.icp, **few), (x, y), same, kinks=True
         ),
-        "refine.point_to_plane.plane_metric": Row(
-            functools.partial(point_to_plane.plane_metric, weighting=WIDE),
-            (x, y, tilted, pairs()),
-            ((x, x, 0 * x, pairs()), (x, x, tilted, none(pairs()))),
-        ),
-        "refine.point_to_plane.point_to_plane_step": Row(
-            functools.partial(point_to_plane.point_to_plane_step, weighting=WIDE),
+        "refine.point_to_plane.plane_cost": Row(
+            lambda *a: cost_of(point_to_plane.plane_cost)(*a[:3], None, *a[3:]),
             (IDENTITY, x, y, tilted, pairs()),
             ((IDENTITY, x, x, 0 * x, pairs()), (pose(), x, y, tilted, none(pairs()))),
         ),
         "refine.point_to_plane.point_to_plane": Row(
-            functools.partial(point_to_plane.point_to_plane, **near), (x, y), same, kinks=True
+            functools.partial(point_to_plane.point_to_plane, **few), (x, y), same, kinks=True
         ),
-        "refine.gicp.gicp_step": Row(
-            lambda *a: from_gicp(*a[:-1], pairs=a[-1]),
+        "refine.gicp.surface_cost": Row(
+            cost_of(generalized.cost),
             (IDENTITY, x, y, definite(), definite(), pairs()),
             ((IDENTITY, x, x, definite(), definite(), none(pairs())),),
         ),
-        "refine.gicp.gicp": Row(functools.partial(gicp.gicp, **near), (x, y), same, kinks=True),
+        "refine.gicp.gicp": Row(functools.partial(gicp.gicp, **few), (x, y), same, kinks=True),
+        "refine.methods.refine": Row(
+            functools.partial(methods.refine, **solution), (x, y), same, kinks=True
+        ),
+        "refine.solve.set_up": Row(entered_problem, (x, y), same),
+        "refine.solve.solve": Row(
+            lambda x, y: solve.solve(problem(x, y), point_to_point.POINT_TO_POINT, config=SOLUTION),
+            (x, y),
+            same,
+            kinks=True,
+        ),
+        # Its value is the pose that it is given.
+        "refine.solve.at_fixed_point": Row(
+            fixed_point,
+            (turned, x, y, tilted),
+            ((IDENTITY, x, x, 0 * x), (IDENTITY, x, x + 100, tilted), (IDENTITY, 0 * x, 0 * x, x)),
+            smooth=False,
+        ),
+        "refine.solve.change_of_pose": Row(
+            solve.change_of_pose, (pose(), pose()), ((IDENTITY, IDENTITY),), smooth=False
+        ),
         "refine.uncertainty.pose_uncertainty": Row(
-            lambda t, x, y: uncertain(t, x, y, neighbors=4),
+            functools.partial(uncertainty.pose_uncertainty, **few),
             (IDENTITY, x, y),
             every(lambda x: (IDENTITY, x, x)),
             kinks=True,

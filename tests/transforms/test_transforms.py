@@ -28,11 +28,12 @@ HOST = {
     "weights.released.available_weights",
     "weights.released.load_pretrained",
 }
-HOST |= {"scans.pair.register", "geometry.frame.check_clouds", "refine.robust.check_options"}
+HOST |= {"scans.pair.register", "geometry.frame.check_clouds", "refine.config.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
+HOST |= {"refine.gicp.generalized", "refine.methods.method_of"}
 HOST |= {"geometry.rigid.rotation_angle_deg", "geometry.frame.nearest_rotation"}
 HOST |= {f"geometry.frame.{name}" for name in ("common_frame", "pose_in", "pose_out")}
-"""Functions that read files or numpy arrays on the host: no transform applies to them."""
+"""Functions of settings, files or numpy arrays on the host: no transform applies to them."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
@@ -51,7 +52,11 @@ ROOMS = (
     "network.model",
     "network.losses",
     "geometry.frame",
+    "refine.config",
+    "refine.cost",
     "refine.gauss_newton",
+    "refine.solve",
+    "refine.methods",
     "refine.gicp",
     "refine.point_to_point",
     "geometry.normals",
