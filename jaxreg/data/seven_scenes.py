@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
+
+from jaxreg.io import ply
 
 SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 TEST_SCENE = "office"
@@ -115,12 +116,9 @@ def read_fragment(path: Path) -> np.ndarray:
       ValueError: the file is missing, not PLY, truncated, empty, or has a non-finite vertex.
     """
     try:
-        vertex = PlyData.read(str(path))["vertex"]
-        points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path} cannot be read as PLY with vertices x, y, z ({error}): download it again."
-        ) from None
+        points = ply.read(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read as PLY ({error}): download it again.") from None
     if len(points) == 0:
         raise ValueError(f"{path} holds no point: download it again, or remove it.")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
