@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py) benchmarks research examples
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help demo test coverage slow lint types fuzz mutants tables figures docs baselines clean
+.PHONY: help demo test coverage slow lint types wheel docs fuzz mutants tables figures baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -28,11 +28,14 @@ lint: $(VENV)/.installed-dev  ## style, and the order of imports between the roo
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/lint-imports
 
-types: $(VENV)/.installed-dev  ## what pyright says (not yet clean: numpy where a jax array is declared)
+types: $(VENV)/.installed-dev  ## what pyright says of the package
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+wheel: $(BIN)/python  ## build the wheel, install it without extras elsewhere, and use it (2 minutes)
+	$(BIN)/python tests/wheel.py
+
 fuzz: $(VENV)/.installed-dev  ## 10,000 examples of whatever may be given to register()
-	$(BIN)/python -m pytest -n 2 tests/test_fuzz.py --hypothesis-profile=fuzz
+	$(BIN)/python -m pytest -n 2 tests/scans/test_fuzz.py --hypothesis-profile=fuzz
 
 mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
 	$(BIN)/python tests/mutants.py
@@ -45,7 +48,7 @@ tables: $(VENV)/.installed-baselines  ## figures of the released weights and of 
 figures: $(VENV)/.installed  ## the pictures of the documentation
 	$(BIN)/python -m benchmarks.figures
 
-docs: $(VENV)/.installed-docs  ## build the site; open site/index.html
+docs: $(VENV)/.installed-docs  ## build the site (open site/index.html); a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:  ## remove the environment, caches and runs
@@ -58,7 +61,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.installed: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable ".[train,view]"
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
@@ -66,7 +69,7 @@ $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-baselines: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[baselines]"
+	$(BIN)/python -m pip install --quiet --editable ".[train,view,baselines]"
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python

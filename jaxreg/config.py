@@ -255,7 +255,7 @@ def _build(cls: type, content: dict[str, Any], where: str) -> Any:
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         if not isinstance(value, dict):
             raise ValueError(f"{where} is a section: write [{where.split()[-1]}] and its fields.")
         return _build(hint, value, where)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxreg._extras import extra
 from jaxreg._xla import jit
 from jaxreg.config import Config, TrainConfig
-from jaxreg.data import load_shapes, training_label
+from jaxreg.data import load_training, training_label
 from jaxreg.data.batches import pair_batches, validation_key
 from jaxreg.data.pairs import make_pair, shape_points
 from jaxreg.evaluation.methods import network_method
@@ -138,7 +138,9 @@ def train_step(
     decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
     average = optax.incremental_update(variables, state.average, 1 - decay)
     logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms}
-    return TrainState(state.step + 1, variables, average, optimizer), logged
+    return state._replace(
+        step=state.step + 1, variables=variables, average=average, optimizer=optimizer
+    ), logged
 
 
 _train_step_jit = jit(train_step, static_argnames="config", donate_argnums=0)
@@ -186,14 +188,11 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     """
     _check_options(config.train)
     checkpoint.check_place(workdir)
-    shapes, _ = load_shapes(
-        config.data, "train", root=root, points=shape_points(config.pairs), seed=config.train.seed
-    )
-    held_out, _ = load_shapes(
+    shapes, held_out = load_training(
         config.data,
-        "validation",
         root=root,
-        points=shape_points(config.test_pairs),
+        points=shape_points(config.pairs),
+        validation_points=shape_points(config.test_pairs),
         seed=config.train.seed,
     )
     on_device = jnp.asarray(shapes)

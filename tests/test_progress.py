@@ -2,6 +2,7 @@
 
 import io
 
+import numpy as np
 from rich.console import Console
 
 from jaxreg import progress
@@ -54,9 +55,21 @@ def test_without_a_terminal_there_is_a_line_at_the_start_each_validation_and_the
     entries[49]["val_mie_r_deg"] = 0.125
     lines = run(Console(file=io.StringIO(), width=40), entries, 100).splitlines()
     assert [line.split()[1] for line in lines] == ["1/100", "50/100", "100/100"]
+    assert "error" not in lines[0]
+    assert "left" not in lines[0], "one step says nothing of the time of a step"
     assert "error 0.125 deg" in lines[1]
     assert "left" in lines[1]
     assert "error 0.125 deg" in lines[2], "the last known error stays"
+
+
+def test_without_a_terminal_there_is_a_line_every_twenty_seconds(monkeypatch):
+    clock = iter(np.arange(0, 1000, 7.0))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+    # A resumed run: its clock starts at step 91.
+    entries = [{"step": step, "loss": 2.0} for step in range(91, 101)]
+    lines = run(Console(file=io.StringIO(), width=40), entries, 100).splitlines()
+    assert [line.split()[1] for line in lines] == ["91/100", "94/100", "97/100", "100/100"]
+    assert "about 42 s left" in lines[1], "7 s a step"
 
 
 def test_on_a_terminal_there_is_a_bar_with_loss_error_and_time():
@@ -84,11 +97,12 @@ def count(console, parts, total, monkeypatch, seconds_a_part):
 
 def test_counting_without_a_terminal_prints_lines_and_the_throughput(monkeypatch):
     console = Console(file=io.StringIO(), width=40)
-    # The clock is read when the run and when its lines begin, at every part, and at the end.
+    # The clock is read at the start, at every part, and at the end.
     lines = count(console, [8, 8, 8, 4], 28, monkeypatch, seconds_a_part=15)
-    assert [line.split(",")[0] for line in lines[:-1]] == ["icp: 16/28"]
-    assert "about 22 s left" in lines[0]
-    assert lines[-1] == "icp: 28 pairs in 90.0 s, 0.3 pairs/s"
+    assert [line.split()[1] for line in lines[:-1]] == ["8/28", "24/28"]
+    # 16 pairs in 30 s after the first part, so 4 in 7.5.
+    assert lines[1] == "pairs 24/28  icp  about 8 s left"
+    assert lines[-1] == "icp: 28 pairs in 75.0 s, 0.4 pairs/s"
 
 
 def test_counting_on_a_terminal_is_a_bar_and_the_throughput_stays():

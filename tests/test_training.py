@@ -149,13 +149,13 @@ def test_another_configuration_does_not_resume(config, tmp_path):
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_says_where(config, tmp_path, monkeypatch):
-    clean = training.load_shapes
+    clean = training.load_training
 
     def poisoned(*arguments, **options):
-        clouds, labels = clean(*arguments, **options)
-        return clouds * np.float32(np.nan), labels
+        clouds, held_out = clean(*arguments, **options)
+        return clouds * np.float32(np.nan), held_out
 
-    monkeypatch.setattr(training, "load_shapes", poisoned)
+    monkeypatch.setattr(training, "load_training", poisoned)
     with pytest.raises(FloatingPointError, match="step 1"):
         training.train(config, tmp_path)
 
@@ -278,7 +278,7 @@ def test_settings_at_the_end_of_their_range_are_taken():
 
 @pytest.mark.parametrize("inside", ["", "runs/own"])
 def test_a_workdir_that_is_a_file_is_refused_before_the_work(config, tmp_path, inside, monkeypatch):
-    monkeypatch.setattr(training, "load_shapes", None)  # Reading the data would fail.
+    monkeypatch.setattr(training, "load_training", None)  # Reading the data would fail.
     (tmp_path / "README.md").write_text("text")
     with pytest.raises(ValueError, match="README.md is a file: name a directory by --workdir"):
         training.train(config, tmp_path / "README.md" / inside)
@@ -317,7 +317,7 @@ def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
             path.write_bytes(b"")
     # In a process of its own: reads that are still under way fail later, in threads, and pytest would
     # blame whatever test runs by then.
-    code = f"from jaxreg import training; checkpoint.load_checkpoint({str(tmp_path)!r})"
+    code = f"from jaxreg.weights import checkpoint; checkpoint.load_checkpoint({str(tmp_path)!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert re.search(r"ValueError: .*best cannot be read \(.*\): put a whole copy", done.stderr)

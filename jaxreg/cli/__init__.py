@@ -6,6 +6,7 @@ Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted, 
 import gc
 import importlib
 import sys
+from typing import Any
 
 import tyro
 
@@ -19,11 +20,11 @@ from jaxreg.cli.view import View
 __all__ = ["main"]
 
 
-class Train:
+class _Train:
     """Train a network on pairs that a configuration describes: jaxreg train CONFIG.toml ..."""
 
 
-class Evaluate:
+class _Evaluate:
     """Evaluate a network or another method on such pairs: jaxreg evaluate CONFIG.toml ..."""
 
 
@@ -41,8 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
         process.restart_with_huge_pages()
     if given and given[0] in _WITH_CONFIGURATION:
         return importlib.import_module(f"jaxreg.cli.{given[0]}").main(given[1:])
-    command = tyro.extras.subcommand_cli_from_dict(
-        {"register": Register, "info": Info, "view": View, "train": Train, "evaluate": Evaluate},
+    command: Any = tyro.extras.subcommand_cli_from_dict(
+        {"register": Register, "info": Info, "view": View, "train": _Train, "evaluate": _Evaluate},
         prog="jaxreg",
         description="Rigid registration of point clouds (jaxreg --version tells which).",
         args=given,

@@ -192,6 +192,4 @@ def _write(options: Options, config: Config, root: Path | None, scored: score.Sc
         _, batches = score.pair_stream(config, root=root, pairs=options.pairs)
         score.save_pairs(options.save_pairs, batches)
     if options.picture:
-        from jaxreg.view import pictures
-
-        pictures.draw_first_pair(options.picture, scored)
+        score.draw_first_pair(options.picture, scored)

@@ -14,7 +14,7 @@ def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
     that others could write to would run their code, so the directory is private (0700). Set
     JAX_COMPILATION_CACHE_DIR to choose another. Where none can be made, nothing is kept.
     """
-    if not jax.config.jax_compilation_cache_dir:
+    if not cache_directory():
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         directory = root / "jaxreg" / "xla"
         try:
@@ -23,6 +23,11 @@ def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
             return
         jax.config.update("jax_compilation_cache_dir", str(directory))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", least_seconds)
+
+
+def cache_directory() -> str | None:
+    """Where JAX keeps compiled programs on disk; None where it keeps none."""
+    return getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009 - a name made at run time
 
 
 _HUGE_PAGES = "glibc.malloc.hugetlb"

@@ -216,11 +216,10 @@ def _write_json(path: Path, command: Register, result: "ScanRegistration") -> No
 @contextlib.contextmanager
 def _patience() -> Iterator[None]:
     """A spinner on a terminal; and once, where a program is not on disk yet, a word about that."""
-    import jax
     from jax import monitoring
 
     process.enable_compilation_cache(least_seconds=0.0)
-    directory, said = jax.config.jax_compilation_cache_dir, False
+    directory, said = process.cache_directory(), False
 
     def listen(event: str, **_) -> None:
         nonlocal said

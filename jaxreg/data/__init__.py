@@ -18,6 +18,7 @@ __all__ = [
     "data_root",
     "dataset_label",
     "load_shapes",
+    "load_training",
     "make_pair",
     "make_pair_from_scans",
     "pair_sizes",
@@ -26,6 +27,8 @@ __all__ = [
 ]
 
 Split = Literal["train", "validation", "test"]
+_ANY_POINTS = ("folder", "seven_scenes")
+"""Sources of files that are resampled to as many points as are asked for."""
 
 
 def data_root(
@@ -81,20 +84,35 @@ def load_shapes(
         raise ValueError(f"split must be 'train', 'validation' or 'test', got {split!r}.")
     if config.name == "shapes":
         return _load_procedural(config, split, points, seed)
-    if root is None and config.name != "folder":
-        raise ValueError(
-            f"data.name = '{config.name}' is read from files, and no folder is known: give "
-            "--data-root, set $JAXREG_DATA, make data/ beside the configuration file, or use "
-            "data.name = 'shapes', which needs no file."
-        )
-    clouds, labels = _load_files(config, "test" if split == "test" else "train", root, points, seed)
     if split == "test":
-        return clouds, labels
-    # By fragment, so that no draw of a validated fragment is trained on.
-    draws = config.train_draws if config.name == "seven_scenes" else 1
-    held_out = np.repeat(_held_out(len(clouds) // draws, config.validation_share, seed), draws)
-    chosen = held_out == (split == "validation")
+        return _load_files(config, "test", root, points, seed)
+    clouds, labels = _load_files(config, "train", root, points, seed)
+    chosen = _held_out_rows(config, len(clouds), seed) == (split == "validation")
     return clouds[chosen], labels[chosen]
+
+
+def load_training(
+    config: DataConfig,
+    *,
+    root: str | Path | None = None,
+    points: int,
+    validation_points: int,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The clouds of `load_shapes` for training and for validation, from one reading of the files.
+
+    Where the source can choose, they have `points` and `validation_points` points. Errors as
+    `load_shapes`.
+    """
+
+    def load(split: Split, points: int) -> np.ndarray:
+        return load_shapes(config, split, root=root, points=points, seed=seed)[0]
+
+    if config.name == "shapes" or (points != validation_points and config.name in _ANY_POINTS):
+        return load("train", points), load("validation", validation_points)
+    clouds, _ = _load_files(config, "train", root, points, seed)
+    held_out = _held_out_rows(config, len(clouds), seed)
+    return clouds[~held_out], clouds[held_out]
 
 
 def dataset_label(config: DataConfig, root: str | Path | None) -> str:
@@ -151,6 +169,13 @@ def _load_files(
         return folder.load(
             config.folder, split, points=points, test_share=config.test_share, seed=seed
         )
+    if root is None:
+        raise ValueError(
+            f"data.name = '{config.name}' is read from files, and no folder is known: give "
+            "--data-root, set $JAXREG_DATA, make data/ beside the configuration file (in the working "
+            "directory for one that comes with jaxreg), or use data.name = 'shapes', which needs no "
+            "file."
+        )
     if config.name == "modelnet40":
         categories = config.train_categories if split == "train" else config.test_categories
         return modelnet.load(root, split, categories=categories)
@@ -168,6 +193,13 @@ def _load_files(
         "data.name must be 'modelnet40', 'shapes', 'folder', 'seven_scenes' or 'icl_nuim', "
         f"got {config.name!r}."
     )
+
+
+def _held_out_rows(config: DataConfig, count: int, seed: int) -> np.ndarray:
+    """Which of `count` training clouds are for validation."""
+    # By fragment, so that no draw of a validated fragment is trained on.
+    draws = config.train_draws if config.name == "seven_scenes" else 1
+    return np.repeat(_held_out(count // draws, config.validation_share, seed), draws)
 
 
 def _held_out(count: int, share: float, seed: int) -> np.ndarray:

@@ -55,8 +55,8 @@ def _given_batch(key, numbers, source, target, transform, *, config: PairConfig)
         pose = RigidTransform(matrix[:3, :3], matrix[:3, 3])
         everywhere = jnp.ones(source.shape[0], bool)
         still = rigid.apply(rigid.inverse(pose), target)
-        clouds = (PointCloud(points, everywhere) for points in (source, still))
-        return make_pair_from_scans(jax.random.fold_in(key, number), *clouds, config, pose)
+        x, y = PointCloud(source, everywhere), PointCloud(still, everywhere)
+        return make_pair_from_scans(jax.random.fold_in(key, number), x, y, config, pose)
 
     return jax.vmap(one)(numbers, source, target, transform)
 

@@ -24,7 +24,6 @@ from jaxreg.peers.rienet import load_rienet
 from jaxreg.progress import counting_progress
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import Pair, RigidTransform
-from jaxreg.view.pictures import plot_pair
 from jaxreg.weights import checkpoint as checkpoints
 from jaxreg.weights.checkpoint import load_checkpoint
 from jaxreg.weights.released import available_weights, load_pretrained
@@ -245,6 +244,8 @@ def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 
 def draw_first_pair(path: str | Path, scored: Scored) -> None:
     """Draw the first pair of an evaluation before and after, in the pose that was evaluated."""
+    from jaxreg.view.pictures import plot_pair  # matplotlib, which an evaluation does not need
+
     source, reference, truth = scored.first
     transform = jax.tree.map(lambda x: np.asarray(x)[0], scored.predicted)
     plot_pair(

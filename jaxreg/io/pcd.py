@@ -85,8 +85,8 @@ def _integer(path: Path, header: dict[str, list[str]], name: str) -> int:
 
 
 def _ascii(path: Path, body: bytes, row: np.dtype, count: int) -> np.ndarray:
-    starts = np.cumsum([0] + [int(np.prod(row[name].shape)) for name in row.names])
-    columns = [starts[row.names.index(axis)] for axis in "xyz"]
+    starts = np.cumsum([0] + [int(np.prod(row[name].shape)) for name in _names(row)])
+    columns = [starts[_names(row).index(axis)] for axis in "xyz"]
     lines = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
     if len(lines) < count:
         raise ValueError(
@@ -143,9 +143,13 @@ def _columns(path: Path, content: bytes, row: np.dtype, count: int) -> np.ndarra
     if len(content) < count * row.itemsize:
         raise ValueError(f"{path}: the compressed data hold fewer than {count} points: save again.")
     columns, position = {}, 0
-    for name in row.names:
+    for name in _names(row):
         columns[name] = np.frombuffer(
             content, row[name].base, count * int(np.prod(row[name].shape)), position
         )
         position += count * row[name].itemsize
     return np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+
+
+def _names(row: np.dtype) -> tuple[str, ...]:
+    return row.names or ()

@@ -61,15 +61,16 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
 
 
 def _moved(vertex: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    kinds = [(name, "f8" if name in "xyz" else vertex.dtype[name]) for name in vertex.dtype.names]
+    fields = vertex.dtype.names or ()
+    kinds = [(name, "f8" if name in "xyz" else vertex.dtype[name]) for name in fields]
     moved = np.empty(len(vertex), kinds)
-    for name in vertex.dtype.names:
+    for name in fields:
         moved[name] = vertex[name]
     points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
     for axis, column in zip("xyz", (points @ rotation.T + translation).T, strict=True):
         moved[axis] = column
     names = ("nx", "ny", "nz")
-    if set(names) <= set(vertex.dtype.names):
+    if set(names) <= set(fields):
         normals = np.stack([vertex[name] for name in names], axis=1)
         for name, column in zip(names, (normals @ rotation.T).T, strict=True):
             moved[name] = column

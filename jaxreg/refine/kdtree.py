@@ -83,15 +83,14 @@ def iterate(
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    The kernel narrows to its final width in `config.iterations` steps; where one is below
-    `config.tolerance` half of the remaining widths are skipped. At the final width as many follow,
-    until one is below. Large clouds first converge with every k-th point.
+    The kernel narrows to its final width. Where a step is below `config.tolerance` half of the
+    remaining widths are skipped, and at the final width all are. Large clouds first converge with
+    every k-th point.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
-    widths = np.concatenate([widths, np.ones_like(widths)])
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     levels = (
-        [(stride, widths)] if stride == 1 else [(stride, widths), (1, widths[len(widths) // 2 :])]
+        [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
     )
     # The distance is in the weighting; one of every pair its own would compile every time.
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)

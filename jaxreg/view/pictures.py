@@ -162,4 +162,4 @@ def _binned(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     size = -(-len(steps) // _CURVE_POINTS)
     edges = np.arange(0, len(steps), size)
     counts = np.diff(np.append(edges, len(steps)))
-    return tuple(np.add.reduceat(x, edges) / counts for x in (steps, values))
+    return np.add.reduceat(steps, edges) / counts, np.add.reduceat(values, edges) / counts

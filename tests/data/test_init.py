@@ -4,7 +4,7 @@ import pytest
 
 from jaxreg.config import DataConfig
 from jaxreg.data import data_root as find_root
-from jaxreg.data import dataset_label, load_shapes
+from jaxreg.data import dataset_label, load_shapes, load_training, modelnet
 
 
 def write_modelnet(root, count=40, points=8):
@@ -62,6 +62,45 @@ def test_procedural_shapes_need_no_root_and_share_nothing():
     assert len({tuple(c.ravel()) for clouds in loads.values() for c in clouds}) == 51
     other = load_shapes(config, "train", points=16, seed=1)[0]
     assert (other != loads["train"]).any()
+
+
+@pytest.mark.parametrize(
+    ("config", "validation_points", "reads"),
+    [
+        (DataConfig(), 8, 1),
+        (DataConfig(), 4, 1),  # of these files every shape has as many points as it has
+        (DataConfig(name="shapes", train_shapes=6), 4, 0),
+    ],
+)
+def test_training_and_validation_come_from_one_reading(
+    config, validation_points, reads, tmp_path, monkeypatch
+):
+    write_modelnet(tmp_path)
+    sizes = {"train": 8, "validation": validation_points}
+    apart = [
+        load_shapes(config, split, root=tmp_path, points=number, seed=3)[0]
+        for split, number in sizes.items()
+    ]
+    read, load = [], modelnet.load
+    monkeypatch.setattr(modelnet, "load", lambda *a, **k: read.append(a) or load(*a, **k))
+    together = load_training(
+        config, root=tmp_path, points=8, validation_points=validation_points, seed=3
+    )
+    assert len(read) == reads
+    for one, other in zip(apart, together, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_clouds_of_another_size_are_drawn_for_validation(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    for i in range(4):
+        np.save(tmp_path / f"{i}.npy", rng.normal(size=(40, 3)))
+    config = DataConfig(name="folder", folder=str(tmp_path), validation_share=0.4)
+    for validation_points in (10, 20):
+        clouds = load_training(config, points=20, validation_points=validation_points, seed=seed)
+        assert [x.shape[1] for x in clouds] == [20, validation_points]
+        apart = load_shapes(config, "validation", points=validation_points, seed=seed)[0]
+        np.testing.assert_array_equal(clouds[1], apart)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, 0.999, -0.1])

@@ -116,10 +116,10 @@ def test_initial_pose_is_used(seed):
 
 
 BAD = {
-    "must have shape": np.zeros((20, 2)),
-    "not numeric": np.array([["a", "b", "c"]] * 20),
-    "first in row 3": np.where(np.arange(20)[:, None] >= 3, np.nan, np.zeros((20, 3))),
-    "need more": np.zeros((4, 3)),
+    "has shape": np.zeros((20, 2)),
+    "has dtype": np.array([["a", "b", "c"]] * 20),
+    "point 3 is": np.where(np.arange(20)[:, None] >= 3, np.nan, np.zeros((20, 3))),
+    "2 finite points": np.zeros((2, 3)),
 }
 
 

@@ -8,17 +8,9 @@ from scipy.spatial.transform import Rotation
 from jaxreg.geometry import rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import closest_pairs
-from jaxreg.refine.kdtree import index_cloud, iterate, padded_size, tree_pairs
+from jaxreg.refine.kdtree import index_cloud, iterate, tree_pairs
 from jaxreg.refine.robust import Weighting
 from jaxreg.types import RigidTransform
-
-
-def test_few_sizes_cover_all_counts():
-    counts = np.arange(1, 100_000)
-    sizes = np.array([padded_size(int(count)) for count in counts])
-    assert (sizes >= counts).all()
-    assert (sizes[counts >= 256] <= 1.25 * counts[counts >= 256]).all()
-    assert len(np.unique(sizes)) < 45
 
 
 def test_the_last_width_is_used_where_a_wider_one_stands_still():
