@@ -24,7 +24,6 @@ import numpy as np
 
 from jaxreg import config as configuration
 from jaxreg.config import Config
-from jaxreg.io.arrays import read_arrays
 
 _SHIPPED = Path(__file__).parent
 _VARIABLE = "JAXREG_WEIGHTS"
@@ -60,6 +59,8 @@ def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises:
       ValueError: there are no such weights (the message lists the names), or a file is damaged.
     """
+    from jaxreg.io.arrays import read_arrays  # and with it every format of clouds
+
     path = _find(name).with_suffix(".npz")
     return read_arrays(path, remedy="copy it again, or train again"), load_card(name)
 
