@@ -1,6 +1,12 @@
-"""Weighted Procrustes against scipy, and its own derivative against finite differences."""
+"""Weighted Procrustes against scipy, and its own derivative against finite differences.
+
+T01 to T22 are the degenerate cases that every room is tested with.
+"""
 
 import functools
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import procrustes
 from tests import oracles
+from tests.scenes import assert_proper, moved, pose, shape
 
 weighted_procrustes = jax.jit(procrustes.weighted_procrustes)
 special_procrustes = jax.jit(procrustes.special_procrustes)
@@ -53,13 +60,9 @@ def noisy_problem(rng, n=20, noise=0.3):
     return source, reference + noise * rng.normal(size=(n, 3)), weights
 
 
-def assert_proper(rotation, tolerance=1e-12):
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=tolerance)
-    assert np.linalg.det(rotation) == pytest.approx(1, abs=tolerance)
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.1, 1.0, 3.0])
 def test_equals_scipy_with_noise(rng, noise):
+    """T02."""
     # On exact data a solver that squares its weights passes too.
     for _ in range(10):
         problem = noisy_problem(rng, noise=noise)
@@ -67,6 +70,26 @@ def test_equals_scipy_with_noise(rng, noise):
         expected = oracles.procrustes(*problem)
         np.testing.assert_allclose(rotation, expected[0], atol=1e-12)
         np.testing.assert_allclose(translation, expected[1], atol=1e-12)
+
+
+def test_identical_clouds_stay(rng):
+    """T01."""
+    points = shape(rng)
+    rotation, translation = weighted_procrustes(points, points, np.ones(len(points)))
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(translation, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("generic", [False, True], ids=["z = 0", "any plane"])
+def test_coplanar_points_have_one_rotation(rng, generic):
+    """T04."""
+    points = rng.normal(size=(20, 3)) * [1.0, 1.0, 0.0]
+    if generic:
+        points = moved(points, *pose(rng))
+    problem = points, moved(points, *pose(rng)), rng.uniform(0.1, 1, 20)
+    result, expected = weighted_procrustes(*problem), oracles.procrustes(*problem)
+    np.testing.assert_allclose(result.rotation, expected[0], atol=1e-12)
+    np.testing.assert_allclose(result.translation, expected[1], atol=1e-12)
 
 
 def test_no_rotation_nearby_costs_less(rng):
@@ -111,6 +134,7 @@ def test_float32_at_any_scale(rng, scale):
 
 
 def test_a_weight_counts_as_often_as_the_point_occurs(rng):
+    """T08."""
     source, reference, _ = noisy_problem(rng, n=6)
     times = np.array([3, 1, 2, 0, 1, 4])
     result = weighted_procrustes(source, reference, times.astype(float))
@@ -122,35 +146,44 @@ def test_a_weight_counts_as_often_as_the_point_occurs(rng):
 
 
 def test_swapping_the_clouds_inverts_the_transform(rng):
+    """T03."""
     source, reference, weights = noisy_problem(rng)
     there = weighted_procrustes(source, reference, weights)
     back = weighted_procrustes(reference, source, weights)
     np.testing.assert_allclose(there.rotation @ back.rotation, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(moved(moved(source, *there), *back), source, atol=1e-12)
 
 
 def test_mirrored_reference_gives_the_best_rotation_not_a_mirror(rng):
+    """T16."""
     source, _, weights = noisy_problem(rng)
     reference = source * np.array([1.0, 1.0, -1.0])
     rotation, translation = weighted_procrustes(source, reference, weights)
-    assert_proper(rotation)
+    assert_proper(rotation, 1e-12)
     expected = oracles.procrustes(source, reference, weights)
     np.testing.assert_allclose(rotation, expected[0], atol=1e-10)
     np.testing.assert_allclose(translation, expected[1], atol=1e-10)
 
 
-def test_the_24_rotations_of_the_cube(rng):
+def test_right_angles_and_the_24_rotations_of_the_cube(rng):
+    """T13."""
     source, _, weights = noisy_problem(rng)
-    for rotation in Rotation.create_group("O").as_matrix():
+    axis = rng.normal(size=3)
+    turns = np.radians([[90], [120], [180]]) * axis / np.linalg.norm(axis)
+    cube = Rotation.create_group("O")
+    for rotation in Rotation.concatenate([cube, Rotation.from_rotvec(turns)]).as_matrix():
         result = weighted_procrustes(source, source @ rotation.T + 1.0, weights)
         np.testing.assert_allclose(result.rotation, rotation, atol=1e-12)
         np.testing.assert_allclose(result.translation, 1.0, atol=1e-12)
 
 
 def test_weights_that_vanish(rng):
+    """T17."""
     source, reference, _ = noisy_problem(rng, n=5)
-    rotation, translation = weighted_procrustes(source, reference, np.zeros(5))
-    np.testing.assert_array_equal(rotation, np.eye(3))
-    np.testing.assert_array_equal(translation, 0)
+    for weights in (np.zeros(5), -np.ones(5)):
+        rotation, translation = weighted_procrustes(source, reference, weights)
+        np.testing.assert_array_equal(rotation, np.eye(3))
+        np.testing.assert_array_equal(translation, 0)
     one_hot = np.eye(5)[2]
     rotation, translation = weighted_procrustes(source, reference, one_hot)
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-15)
@@ -189,6 +222,7 @@ NAMES = sorted(degenerate_clouds(np.random.default_rng(0)))
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", NAMES)
 def test_degenerate_clouds_give_a_rotation_and_finite_derivatives(rng, name, dtype):
+    """T05, T06."""
     source = degenerate_clouds(rng)[name]
     tolerance = 1e-10 if dtype == "float64" else 1e-5
     rotation = Rotation.random(rng=rng).as_matrix()
@@ -201,8 +235,8 @@ def test_degenerate_clouds_give_a_rotation_and_finite_derivatives(rng, name, dty
     result = weighted_procrustes(*problem)
     assert_proper(result.rotation, tolerance)
     if name != "mirrored":  # Whatever R is, it moves the points to where they belong.
-        moved = source @ np.asarray(result.rotation, float).T + np.asarray(result.translation)
-        np.testing.assert_allclose(moved, reference, atol=10 * tolerance)
+        pose = (np.asarray(part, float) for part in result)
+        np.testing.assert_allclose(moved(source, *pose), reference, atol=10 * tolerance)
     for derivative in jax.tree.leaves(derivatives(*problem)):
         assert np.isfinite(derivative).all()
 
@@ -255,6 +289,7 @@ def test_derivative_is_zero_along_motions_that_change_nothing(rng):
 
 @pytest.mark.parametrize("argument", [0, 1, 2])
 def test_derivatives_of_the_transform_by_each_input(rng, argument):
+    """T22."""
     problem = list(noisy_problem(rng, n=8))
     direction = [np.zeros_like(x) for x in problem]
     direction[argument] = rng.normal(size=problem[argument].shape)
@@ -359,6 +394,32 @@ def test_the_robust_derivative_equals_finite_differences(rng, exact):
             lambda x: [jax.jit(turn)(x[0])], [source], [direction]
         )
         assert np.sum(gradient * direction) == pytest.approx(float(difference), abs=1e-6)
+
+
+TWO_DEVICES = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from jaxreg import knn, weighted_procrustes
+
+assert len(jax.devices()) == 2
+rng = np.random.default_rng(0)
+source, reference = rng.normal(size=(2, 4, 20, 3)).astype(np.float32)
+weights = rng.uniform(size=(4, 20)).astype(np.float32)
+mesh = jax.make_mesh((2,), ("pairs",), axis_types=(AxisType.Auto,))
+split = NamedSharding(mesh, PartitionSpec("pairs"))
+run = jax.jit(jax.vmap(lambda x, y, w: (weighted_procrustes(x, y, w), knn(x, 3))))
+one = run(source, reference, weights)
+two = run(*(jax.device_put(x, split) for x in (source, reference, weights)))
+assert len(two[1].sharding.device_set) == 2
+jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b), one, two)
+"""
+
+
+def test_same_input_gives_the_same_bits_on_one_device_and_on_two():
+    """T21."""
+    flags = "--xla_force_host_platform_device_count=2"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", TWO_DEVICES], env=environment, check=True)
 
 
 @pytest.mark.untyped
