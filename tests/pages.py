@@ -82,5 +82,13 @@ def shown_lines(promised: str, printed: str) -> tuple[str, str]:
     return "\n".join(kept), "\n".join(found)
 
 
+def refreshed(promised: str, printed: str) -> str:
+    """The output for a page that leaves out lines, where `promised` says which."""
+    if "..." not in promised.splitlines():
+        return printed
+    lines = iter(shown_lines(promised, printed)[1].splitlines())
+    return "".join(f"{line if line == '...' else next(lines)}\n" for line in promised.splitlines())
+
+
 def words_of(text: str) -> list[str]:
     return re.findall(r"[A-Za-z]{3,}", text)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.pages import compare, run_blocks
+from tests.pages import compare, refreshed, run_blocks
 
 
 @pytest.mark.parametrize(("promised", "printed"), [
@@ -36,3 +36,9 @@ def test_blocks_share_their_names_and_other_programs_are_not_run():
     assert [(match[3], printed) for match, printed in run_blocks(text)] == [
         (None, ""), ("1\n", "1\n"), (None, None)
     ]  # fmt: skip
+
+
+def test_a_page_that_leaves_lines_out_is_refreshed_line_by_line():
+    promised, printed = "found 3\n...\nwrote it\n", "found 4\nfitness 0.9\nwrote it\n"
+    assert refreshed(promised, printed) == "found 4\n...\nwrote it\n"
+    assert refreshed("found 3\n", printed) == printed
