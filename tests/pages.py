@@ -55,13 +55,40 @@ def comparable(text: str) -> tuple[list[str], np.ndarray]:
     """The words, and the numbers, of lines that do not tell a time."""
     lines = [line for line in text.splitlines() if not re.search(r"^time|seconds|\bs$", line)]
     numbers = re.findall(r"(?<![\w.])-?\d[\d,]*\.?\d*(?:e[-+]?\d+)?", "\n".join(lines))
-    words = re.findall(r"[A-Za-z]{3,}", "\n".join(lines))
-    return words, np.array([float(number.replace(",", "")) for number in numbers])
+    return words_of("\n".join(lines)), np.array(
+        [float(number.replace(",", "")) for number in numbers]
+    )
 
 
 def compare(promised: str, printed: str) -> None:
-    """Equal words; numbers that differ by no more than another machine's rounding may cause."""
+    """Equal words; numbers that differ by no more than another machine's rounding may cause.
+
+    A line "..." of a page stands for lines that it leaves out.
+    """
+    if "..." in promised.splitlines():
+        promised, printed = shown_lines(promised, printed)
     (words, numbers), (other_words, others) = comparable(promised), comparable(printed)
     assert words == other_words, printed
     assert numbers.shape == others.shape, printed
     np.testing.assert_allclose(others, numbers, rtol=0.1, atol=0.05, err_msg=printed)
+
+
+def shown_lines(promised: str, printed: str) -> tuple[str, str]:
+    """The promised lines without "...", and those lines of the output that have the same words."""
+    kept = [line for line in promised.splitlines() if line != "..."]
+    rest, found = iter(printed.splitlines()), []
+    for line in kept:
+        found += [next((other for other in rest if words_of(other) == words_of(line)), "")]
+    return "\n".join(kept), "\n".join(found)
+
+
+def refreshed(promised: str, printed: str) -> str:
+    """The output for a page that leaves out lines, where `promised` says which."""
+    if "..." not in promised.splitlines():
+        return printed
+    lines = iter(shown_lines(promised, printed)[1].splitlines())
+    return "".join(f"{line if line == '...' else next(lines)}\n" for line in promised.splitlines())
+
+
+def words_of(text: str) -> list[str]:
+    return re.findall(r"[A-Za-z]{3,}", text)

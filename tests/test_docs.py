@@ -1,10 +1,8 @@
 """The guides and the notebook run as they stand and print what they say.
 
-`python -m tests.test_docs [NAME ...]` runs the guides and the README and writes what they print into
-them.
+`python -m tests.write_pages` runs them and writes what they print into them.
 """
 
-import contextlib
 import json
 import os
 import re
@@ -103,28 +101,3 @@ def test_links_and_configurations_of_guides_exist(path):
         assert (path.parent / name).exists(), name
     for name in re.findall(r"configs/\w+\.toml", text):
         load_config(ROOT / name)
-
-
-def write_pages() -> None:
-    """Run every page, and the README, in a folder of its own and put what it printed below each block.
-
-    Run it twice: the second time nothing is compiled, and the seconds are those of a usual run.
-    """
-    import tempfile
-
-    process.enable_compilation_cache(least_seconds=0.0)
-    chosen = sys.argv[1:] or [*PAGES, "README"]
-    for path in [(PAGES | {"README": ROOT / "README.md"})[name] for name in chosen]:
-        text, pieces, end = path.read_text(encoding="utf-8"), [], 0
-        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-            for match, printed in run_blocks(text):
-                stop = match.end() if printed is None else match.end(2)
-                pieces += [text[end:stop]]
-                if printed is not None:
-                    pieces += ["```\n", f"\n```\n{printed}```\n" if printed else ""]
-                end = match.end()
-        path.write_text("".join([*pieces, text[end:]]), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    sys.exit(write_pages())
