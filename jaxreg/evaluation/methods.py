@@ -248,5 +248,3 @@ def host_method(
         return jax.tree.map(lambda *parts: np.stack(parts), *transforms)
 
     return method
-
-

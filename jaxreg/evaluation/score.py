@@ -4,6 +4,7 @@ Networks, classical methods and transforms that another program made meet the sa
 metrics.
 """
 
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,6 @@ from jaxreg.io.arrays import read_arrays
 from jaxreg.progress import counting_progress
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import Pair, RigidTransform
-from jaxreg.view.pictures import plot_pair
 
 _REFINEMENTS = ("icp", "point_to_plane", "gicp")
 _TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
@@ -146,13 +146,13 @@ def check_given(
 
 def option(config: Config, name: str) -> str:
     """How a command line sets a field to what it is, as in `--test-pairs.outliers 200`."""
-    section, _, field = name.rpartition(".")
+    section, dot, field = name.rpartition(".")
     value = getattr(getattr(config, section) if section else config, field)
-    dashed = name.replace("_", "-")
+    section, field = section.replace("_", "-") + dot, re.sub(r"_(?!$)", "-", field)
     if isinstance(value, bool):
-        return f"--{dashed}" if value else f"--{section.replace('_', '-')}.no-{field.replace('_', '-')}"
+        return f"--{section}{'' if value else 'no-'}{field}"
     values = value if isinstance(value, tuple) else (value,)
-    return " ".join([f"--{dashed}", *map(str, values)])
+    return " ".join([f"--{section}{field}", *map(str, values)])
 
 
 def _without_effect(config: Config, name: str, method: str, transforms: str) -> str:
@@ -251,6 +251,8 @@ def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 
 def draw_first_pair(path: str | Path, scored: Scored) -> None:
     """Draw the first pair of an evaluation before and after, in the pose that was evaluated."""
+    from jaxreg.view.pictures import plot_pair  # matplotlib, which an evaluation does not need
+
     source, reference, truth = scored.first
     transform = jax.tree.map(lambda x: np.asarray(x)[0], scored.predicted)
     plot_pair(
