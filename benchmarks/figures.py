@@ -28,7 +28,7 @@ from benchmarks.search_figure import draw_search
 from jaxreg._xla import jit
 from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import ModelConfig, PairConfig
-from jaxreg.data.batches import pair_batches, test_key
+from jaxreg.data.batches import key_of_tests, pair_batches
 from jaxreg.data.pairs import make_pair
 from jaxreg.data.procedural import shapes
 from jaxreg.evaluation import methods, metrics, run
@@ -190,7 +190,7 @@ def draw_arccos(options: Options, path: Path, count: int = 128) -> None:
     clouds = np.stack(
         [shapes.sample_shape(options.seed, FIRST + i, points=1024) for i in range(count)]
     )
-    batches = pair_batches(clouds, test_key(options.seed), config=CLEAN, batch=8)
+    batches = pair_batches(clouds, key_of_tests(options.seed), config=CLEAN, batch=8)
     method = methods.network_method(variables, config.model)
     predicted, truth, _ = run.evaluate_method(method, batches)
     errors = metrics.pair_errors(predicted, truth)

@@ -9,6 +9,7 @@ and robust_rounds. An option that would change nothing is refused.
 import dataclasses
 import json
 import sys
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
@@ -17,14 +18,12 @@ from rich.console import Console
 
 from jaxreg import io
 from jaxreg.cli import process
-from jaxreg.cli.options import SUCCESS, parse, say, status_of
+from jaxreg.cli.options import SUCCESS, given_fields, parse, say, status_of
 from jaxreg.config import Config
 from jaxreg.data import root_of
-from jaxreg.evaluation import score
+from jaxreg.evaluation import methods, score
 from jaxreg.evaluation.table import results_table
 
-_METHODS = ("checkpoint", "rienet", "method", "transforms")
-_CHOICE = (*_METHODS, "refine", "pairs", "batch")
 _SUFFIXES = {
     "json": (),
     "save_transforms": (".npz",),
@@ -32,7 +31,6 @@ _SUFFIXES = {
     "picture": (".png", ".pdf", ".svg"),
 }
 """The options that name an output, and how its name must end."""
-_TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Options:
     """NPZ file with RIENet's released weights (not ours to ship)."""
     method: str = ""
     """Another method: register, register_global, register_global_learned, icp, identity, or a baseline
-    such as open3d_fgr (a wrong name lists the baselines)."""
+    such as open3d_fgr (a wrong name lists all there are)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
     refine: str = ""
@@ -71,25 +69,45 @@ class Options:
 def main(arguments: list[str] | None = None) -> int:
     """Parse, evaluate, print, write; returns the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    path, options = parse(
-        Options, description=__doc__, arguments=arguments, program="jaxreg evaluate"
-    )
-    return status_of(lambda: _run(options, path, _given(arguments[1:])))
+    program = "jaxreg evaluate"
+    path, options = parse(Options, description=__doc__, arguments=arguments, program=program)
+    return status_of(lambda: _run(options, path, given_fields(Options, arguments)))
 
 
-def _run(options: Options, path: Path, given: dict[str, str]) -> int:
+def _run(options: Options, path: Path, given: Collection[str]) -> int:
     process.enable_compilation_cache()
     _check(options, path)
-    config = _evaluated_config(options, path, given)
+    method = _method(options)
+    score.check_given(options.config, given, method=method, transforms=options.transforms)
+    config = _as_trained(options, path, given, method)
     root = root_of(config.data, options.data_root, path)
-    chosen = {name: getattr(options, name) for name in _CHOICE}
-    scored = score.evaluate(config, root=root, **chosen)
+    scored = score.evaluate(
+        config,
+        root=root,
+        method=method,
+        transforms=options.transforms,
+        refine=options.refine,
+        pairs=options.pairs,
+        batch=options.batch,
+    )
     # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
     try:
         _report(options, path, scored)
     finally:
         _write(options, config, root, scored)
     return SUCCESS
+
+
+def _method(options: Options) -> str:
+    """The name, as of `methods.choose`, that the options give; empty where they give none."""
+    chosen = [
+        options.method,
+        options.checkpoint and f"checkpoint:{options.checkpoint}",
+        options.rienet and f"rienet:{options.rienet}",
+    ]
+    if sum(map(bool, (*chosen, options.transforms))) > 1:
+        raise ValueError("choose one of --checkpoint, --rienet, --method and --transforms.")
+    return "".join(chosen)
 
 
 def _check(options: Options, path: Path) -> None:
@@ -112,70 +130,26 @@ def _check(options: Options, path: Path) -> None:
             taken.append(output)
 
 
-def _given(arguments: list[str]) -> dict[str, str]:
-    """The options of a command line, by the field that they set (`model.n_inliers`)."""
-    options = [word.partition("=")[0] for word in arguments if word.startswith("--")]
-    return {option[2:].replace("-", "_"): option for option in options}
-
-
-def _evaluated_config(options: Options, path: Path, given: dict[str, str]) -> Config:
+def _as_trained(options: Options, path: Path, given: Collection[str], method: str) -> Config:
     """The configuration to evaluate with, after a word on what differs from the file at `path`.
 
-    What the file says of a network is what train.py starts from; a run may have been made with other
+    What the file says of a network is what a training starts from; a run may have been made with other
     options, and its network is evaluated as it was trained. Released weights follow the file, and so
     do robust rounds, which belong to the pairs and not to the training.
-
-    Raises:
-      ValueError: an option of the command line changes nothing; says what to give instead.
     """
-    for name, option in given.items():
-        if reason := _no_effect(name, option, options):
-            raise ValueError(f"{option} changes nothing here: {reason}.")
     config = options.config
     if not options.checkpoint:
         return config
-    model = dataclasses.asdict(score.trained_config(config, checkpoint=options.checkpoint).model)
-    changed = {}
+    trained, changed = methods.trained_config(method), {}
     for name in ("iterations", "n_inliers"):
-        value = getattr(config.model, name)
-        if f"model.{name}" not in given and model[name] != value:
-            changed[name] = model[name]
+        value, wanted = getattr(trained.model, name), getattr(config.model, name)
+        if f"model.{name}" not in given and value != wanted:
+            changed[name] = value
             say(
-                f"model.{name} = {model[name]} as {options.checkpoint} was trained, not {value} as "
-                f"in {path} (to have that: --model.{name.replace('_', '-')} {value})"
+                f"model.{name} = {value} as {options.checkpoint} was trained, not {wanted} as in "
+                f"{path} (to have that: {score.option(config, f'model.{name}')})"
             )
     return dataclasses.replace(config, model=dataclasses.replace(config.model, **changed))
-
-
-def _no_effect(name: str, option: str, options: Options) -> str:
-    """Why an option has no effect on an evaluation, and what to do; empty if it has one."""
-    config, (section, _, field) = options.config, name.partition(".")
-    chosen = next((f"--{method}" for method in _METHODS if getattr(options, method)), "")
-    if name == "weights" and chosen:
-        return f"{chosen} says what is evaluated; leave out one of the two"
-    if not field:
-        return ""
-    if section == "pairs":
-        value = getattr(config.pairs, field, True)
-        text = "" if isinstance(value, bool) else f" {value}"  # A switch has no value.
-        return f"[pairs] are to train on; to test on such pairs give --test-{option[2:]}{text}"
-    if section in ("loss", "train") or (section == "data" and field in _TRAINING_DATA):
-        return "it belongs to the training; give it to train.py, or leave it out"
-    if section != "model":
-        return ""
-    if chosen in ("--method", "--transforms"):
-        return f"{chosen} evaluates no network; leave it out"
-    if field in score.AFTER_TRAINING or not (chosen or config.weights):
-        return ""
-    field = field.removeprefix("no_")
-    trained = score.trained_config(config, checkpoint=options.checkpoint, rienet=options.rienet)
-    value = getattr(trained.model, field)
-    if value == getattr(config.model, field):
-        return ""
-    return (
-        f"the weights were trained with {field} = {value}; leave it out, or give it to train.py and "
-        "evaluate that run by --checkpoint"
-    )
 
 
 def _report(options: Options, path: Path, scored: score.Scored) -> None:

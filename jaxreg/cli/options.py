@@ -1,6 +1,8 @@
 """What the commands share: configurations as arguments, exit statuses, and words on a terminal."""
 
+import dataclasses
 import sys
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -44,6 +46,50 @@ def parse(
         description=description,
     )
     return path, parsed
+
+
+def given_fields(options: type, arguments: list[str]) -> frozenset[str]:
+    """The fields of the configuration that a command line sets after its file, as in `model.k`.
+
+    Parsed twice, from configurations that differ in every field: where the results agree, the command
+    line has spoken. Arguments as `parse` has accepted.
+    """
+    defaults = load_config(arguments[0])
+    first, second = (
+        _leaves(tyro.cli(options, default=options(config=config), args=arguments[1:]).config)
+        for config in (defaults, _different(defaults))
+    )
+    return frozenset(name for name, value in first.items() if value == second[name])
+
+
+_SOMETHING = {int: 1, float: 1.0, str: "1", tuple: (1,)}
+
+
+def _leaves(config: Any) -> dict[str, Any]:
+    leaves = {}
+    for name, value in vars(config).items():
+        if dataclasses.is_dataclass(value):
+            leaves |= {f"{name}.{field}": leaf for field, leaf in _leaves(value).items()}
+        else:
+            leaves[name] = value
+    return leaves
+
+
+def _different(config: Any) -> Any:
+    """The same configuration with another value of the same type in every field."""
+    values = {}
+    for name, hint in typing.get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        if dataclasses.is_dataclass(value):
+            values[name] = _different(value)
+        elif typing.get_origin(hint) is typing.Literal:
+            values[name] = next(x for x in typing.get_args(hint) if x != value)
+        elif isinstance(value, bool):
+            values[name] = not value
+        else:
+            # Twice nothing or infinity is the same again.
+            values[name] = next(x for x in (value * 2, _SOMETHING[type(value)]) if x != value)
+    return type(config)(**values)
 
 
 def status_of(run: Callable[[], int], *, interrupted: str = "interrupted") -> int:

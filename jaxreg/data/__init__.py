@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -183,8 +182,6 @@ def _load_files(
         return icl_nuim.load(root, split)
     if config.name == "seven_scenes":
         stand_in = seven_scenes.TEST_SCENE not in seven_scenes.find_scenes(root)
-        if stand_in:
-            warnings.warn(seven_scenes.describe(root), stacklevel=3)
         draws = config.train_draws if split == "train" else config.test_draws
         return seven_scenes.load(
             root, split, points=points, draws=draws, stand_in=stand_in, seed=seed

@@ -16,7 +16,7 @@ from jaxreg.types import Pair, PointCloud, RigidTransform
 _TEST, _VALIDATION = 0, 1  # Streams of random keys below the seed of the test pairs.
 
 
-def test_key(seed: int) -> PRNGKeyArray:
+def key_of_tests(seed: int) -> PRNGKeyArray:
     """Key of the stream of test pairs; pair `i` of it is made from ``fold_in(key, i)``."""
     return jax.random.fold_in(jax.random.key(seed), _TEST)
 

@@ -1,28 +1,128 @@
-"""Every method that can be scored, by its name: one function from a batch of pairs to transforms."""
+"""Every method by its name, and what each does with a batch of pairs or with two clouds.
+
+`choose` is the one way from a name to a method: evaluation and every benchmark go through it.
+"""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxreg._xla import jit
 from jaxreg.batching import map_pairs
-from jaxreg.config import ModelConfig
-from jaxreg.evaluation import baselines, methods
+from jaxreg.config import Config, ModelConfig
+from jaxreg.evaluation import baselines
 from jaxreg.network.model import Variables, iterate
+from jaxreg.peers.rienet import load_rienet
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
+from jaxreg.refine.point_to_point import icp
 from jaxreg.scans.pair import register
 from jaxreg.search import load_features, register_global
 from jaxreg.search.learned import Network
 from jaxreg.types import Pair, PointCloud, RigidTransform
+from jaxreg.weights.checkpoint import best_config, load_checkpoint
+from jaxreg.weights.released import available_weights, load_pretrained
 
-Method = Callable[[Pair], RigidTransform]
-
+Batch = Callable[[Pair], RigidTransform]
+"""A batch of pairs (a leading axis on every array) to the stacked transforms; the true ones in it
+must not be read."""
 
 Refinement = Callable[[Pair, RigidTransform], RigidTransform]
 """Better poses of a batch from given ones."""
+
+AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
+"""Fields of the model that cost nothing to change after training."""
+
+_OWN = ("identity", "icp", "register", "register_global", "register_global_learned")
+
+
+class Outcome(NamedTuple):
+    """A pose (numpy), and for a method that judges itself whether to trust it and how far."""
+
+    transform: RigidTransform
+    success: bool | None = None
+    probability: float | None = None
+
+
+class Method(NamedTuple):
+    """One method in its two forms: of a batch, and of two clouds (n, 3), (m, 3) in numpy."""
+
+    batch: Batch
+    clouds: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]], Outcome]
+
+
+def names() -> tuple[str, ...]:
+    """What `choose` takes; FILE and DIR stand for a path."""
+    released = tuple(f"weights:{name}" for name in available_weights())
+    return (*_OWN, *released, "rienet:FILE", "checkpoint:DIR", *baselines.NAMES)
+
+
+def choose(name: str, *, model: ModelConfig | None = None) -> Method:
+    """The method of a name, one of `names`.
+
+    `identity` does nothing. Of this library: `icp` (point to point, from where the clouds are),
+    `register` (with all its defaults), `register_global`, and `register_global_learned` (the same
+    with its released features). Trained networks: released weights, RIENet's NPZ file, the best
+    checkpoint of a run; where `model` is given, its `AFTER_TRAINING` fields replace those of the
+    training. The rest are other people's (`jaxreg.evaluation.baselines`), also with the spacing of
+    the points, as in `open3d_fgr@0.02`.
+
+    Raises:
+      ValueError: an unknown name (the message lists those there are), a file or weights that are not
+        there, or a library that is not installed.
+    """
+    match name:
+        case "identity":
+            return Method(identity_method, lambda x, y: Outcome(_IDENTITY))
+        case "icp":
+            return _traced(_plain_icp)
+        case "register":
+            return _host(_registered)
+        case "register_global":
+            return _traced(_global(None))
+        case "register_global_learned":
+            return _traced(_global(load_features()))
+    if _is_network(name):
+        return _network(*load_network_of(name), model)
+    if name.partition("@")[0] in baselines.NAMES:
+        function = baselines.choose(name)
+        return _host(lambda x, y: Outcome(function(x, y)))
+    raise ValueError(f"no method '{name}': choose one of {', '.join(names())}.")
+
+
+def load_network_of(name: str) -> tuple[Variables, Config]:
+    """Variables and configuration of `weights:NAME`, `rienet:FILE` or `checkpoint:DIR`.
+
+    Raises:
+      ValueError: there are no such weights, file or checkpoint.
+    """
+    kind, _, place = name.partition(":")
+    loaders = {
+        "weights": load_pretrained,
+        "rienet": load_rienet,
+        "checkpoint": load_checkpoint,
+    }
+    return loaders[kind](place)
+
+
+def trained_config(name: str) -> Config | None:
+    """The configuration that the network of a name was trained with; None where it is no network.
+
+    Errors as `load_network_of`. Of a checkpoint the arrays are not read.
+    """
+    if not _is_network(name):
+        return None
+    kind, _, place = name.partition(":")
+    return best_config(place)[0] if kind == "checkpoint" else load_network_of(name)[1]
+
+
+def _is_network(name: str) -> bool:
+    kind, colon, place = name.partition(":")
+    return kind in ("weights", "rienet", "checkpoint") and bool(colon and place)
 
 
 def _register_batch(
@@ -42,7 +142,7 @@ def _register_batch(
 _register_batch_jit = jit(_register_batch, static_argnames=("config", "padded"))
 
 
-def network_method(variables: Variables, config: ModelConfig) -> Method:
+def network_method(variables: Variables, config: ModelConfig) -> Batch:
     """The trained network. A batch without padding runs a program of its own, a quarter quicker."""
 
     def method(pair: Pair) -> RigidTransform:
@@ -52,37 +152,67 @@ def network_method(variables: Variables, config: ModelConfig) -> Method:
     return method
 
 
+def _network(variables: Variables, trained: Config, model: ModelConfig | None) -> Method:
+    config = trained.model
+    if model is not None:
+        chosen = {name: getattr(model, name) for name in AFTER_TRAINING}
+        config = dataclasses.replace(config, **chosen)
+    one = jit(lambda x, y: iterate(variables, x, y, config=config)[0])
+    return Method(network_method(variables, config), _of_clouds(one))
+
+
+_IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
+
+
 def identity_method(pair: Pair) -> RigidTransform:
     """Doing nothing: the row that every method must beat."""
     batch = pair.source.mask.shape[0]
     return RigidTransform(np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3)))
 
 
-@jit
-def icp_method(pair: Pair) -> RigidTransform:
-    """Plain point-to-point ICP of this library from the identity."""
+def _plain_icp(source: PointCloud, reference: PointCloud) -> RigidTransform:
+    masks = {"source_mask": source.mask, "reference_mask": reference.mask}
     config = RefineConfig("icp", iterations=50, kernel="none")
-
-    def one(source, reference):
-        masks = {"source_mask": source.mask, "reference_mask": reference.mask}
-        return refine(source.points, reference.points, config=config, **masks).transform
-
-    return map_pairs(one)(pair.source, pair.reference)
+    return icp(source.points, reference.points, config=config, **masks).transform
 
 
-def global_method(network: Network | None = None) -> Method:
-    """`register_global` of this library, from any start; with the features of `network`."""
-
-    def one(source, reference):
+def _global(network: Network | None) -> Callable[[PointCloud, PointCloud], RigidTransform]:
+    def one(source: PointCloud, reference: PointCloud) -> RigidTransform:
         masks = {"source_mask": source.mask, "reference_mask": reference.mask}
         found = register_global(source.points, reference.points, network=network, **masks)
-        return RigidTransform(found.rotation, found.translation)
+        return found.transform
 
-    register_batch = jit(map_pairs(one))
-    return lambda pair: register_batch(pair.source, pair.reference)
+    return one
 
 
-def refined_method(method: Method, refine: Refinement) -> Method:
+def _registered(source: np.ndarray, reference: np.ndarray) -> Outcome:
+    found = register(source, reference)
+    transform = RigidTransform(found.rotation, found.translation)
+    return Outcome(transform, found.success, found.probability)
+
+
+def _traced(one: Callable[[PointCloud, PointCloud], RigidTransform]) -> Method:
+    """Both forms of a pure function of two clouds with masks."""
+    many = jit(map_pairs(one))
+    return Method(lambda pair: many(pair.source, pair.reference), _of_clouds(jit(one)))
+
+
+def _of_clouds(one: Callable) -> Callable[[np.ndarray, np.ndarray], Outcome]:
+    def clouds(source: np.ndarray, reference: np.ndarray) -> Outcome:
+        whole = (
+            PointCloud(jnp.asarray(points), jnp.ones(len(points), bool))
+            for points in (source, reference)
+        )
+        return Outcome(jax.tree.map(np.asarray, one(*whole)))
+
+    return clouds
+
+
+def _host(clouds: Callable[[np.ndarray, np.ndarray], Outcome]) -> Method:
+    return Method(host_method(lambda x, y: clouds(x, y).transform), clouds)
+
+
+def refined_method(method: Batch, refine: Refinement) -> Batch:
     """`method`, then a refinement of its poses (both clouds, nothing learned)."""
     return lambda pair: refine(pair, method(pair))
 
@@ -101,7 +231,7 @@ def refinement(config: RefineConfig) -> Refinement:
 
 def host_method(
     register: Callable[[np.ndarray, np.ndarray], RigidTransform],
-) -> Method:
+) -> Batch:
     """A method from a function of two numpy clouds (n, 3), (m, 3), called pair by pair."""
 
     def method(pair: Pair) -> RigidTransform:
@@ -113,26 +243,3 @@ def host_method(
         return jax.tree.map(lambda *parts: np.stack(parts), *transforms)
 
     return method
-
-
-def choose_method(name: str) -> methods.Method:
-    """A method that no training of a network is needed for.
-
-    `identity`; of this library `icp`, `register` (with all its defaults), `register_global` and
-    `register_global_learned` (with its released features); or a classical baseline.
-
-    Raises:
-      ValueError: an unknown name (the message lists the baselines), or its library is not installed.
-    """
-    match name:
-        case "identity":
-            return methods.identity_method
-        case "icp":
-            return methods.icp_method
-        case "register":
-            return methods.host_method(lambda x, y: RigidTransform(*register(x, y)[:2]))
-        case "register_global":
-            return methods.global_method()
-        case "register_global_learned":
-            return methods.global_method(load_features())
-    return methods.host_method(baselines.choose(name))

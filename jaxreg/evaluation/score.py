@@ -4,8 +4,8 @@ Networks, classical methods and transforms that another program made meet the sa
 metrics.
 """
 
-import dataclasses
-from collections.abc import Iterator
+import re
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,23 +14,17 @@ import numpy as np
 
 from jaxreg.config import Config
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
-from jaxreg.data.batches import given_pair_batches, pair_batches, test_key
+from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
 from jaxreg.evaluation import methods, metrics
-from jaxreg.evaluation.methods import choose_method
 from jaxreg.evaluation.run import evaluate_method
 from jaxreg.io.arrays import read_arrays
-from jaxreg.peers.rienet import load_rienet
 from jaxreg.progress import counting_progress
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import Pair, RigidTransform
-from jaxreg.weights import checkpoint as checkpoints
-from jaxreg.weights.checkpoint import load_checkpoint
-from jaxreg.weights.released import available_weights, load_pretrained
 
 _REFINEMENTS = ("icp", "point_to_plane", "gicp")
-AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
-"""Fields of the model that cost nothing to change after training."""
+_TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
 
 
 class Scored(NamedTuple):
@@ -44,32 +38,6 @@ class Scored(NamedTuple):
     seconds: float | None
 
 
-def trained_config(config: Config, *, checkpoint: str = "", rienet: str = "") -> Config:
-    """The configuration that a network was trained with, chosen as by `evaluate`.
-
-    Raises:
-      ValueError: there is no such checkpoint, file, or name of released weights.
-    """
-    if rienet:
-        return load_rienet(rienet)[1]
-    if checkpoint:
-        return checkpoints.best_config(checkpoint)[0]
-    return load_pretrained(config.weights)[1]
-
-
-def _network(config: Config, checkpoint: str, rienet: str) -> tuple[str, methods.Method]:
-    """A trained network with the architecture it was trained with; `AFTER_TRAINING` as in `config`."""
-    if rienet:
-        label, (variables, trained) = "rienet", load_rienet(rienet)
-    elif checkpoint:
-        label, (variables, trained) = f"checkpoint {checkpoint}", load_checkpoint(checkpoint)
-    else:
-        label, (variables, trained) = f"jaxreg ({config.weights})", load_pretrained(config.weights)
-    chosen = {name: getattr(config.model, name) for name in AFTER_TRAINING}
-    model = dataclasses.replace(trained.model, **chosen)
-    return label, methods.network_method(variables, model)
-
-
 def pair_stream(
     config: Config, *, root: str | Path | None, pairs: int = 0, batch: int = 8
 ) -> tuple[int, Iterator[tuple[Pair, int]]]:
@@ -79,7 +47,7 @@ def pair_stream(
       ValueError: the data is missing or malformed, it comes without pairs although `config` wants
         those, or the sizes of the pairs do not fit it.
     """
-    key = test_key(config.data.test_seed)
+    key = key_of_tests(config.data.test_seed)
     if config.data.test_pairs_from == "file":
         source, target, transforms = _file_pairs(config, root, pairs)
         batches = given_pair_batches(
@@ -111,8 +79,6 @@ def evaluate(
     config: Config,
     *,
     root: str | Path | None = None,
-    checkpoint: str = "",
-    rienet: str = "",
     method: str = "",
     transforms: str = "",
     refine: str = "",
@@ -121,66 +87,107 @@ def evaluate(
 ) -> Scored:
     """Evaluate one method on the test pairs of `config`.
 
-    One of `checkpoint`, `rienet` (the file of its weights), `method` and `transforms` chooses it; with
-    none of them it is the released weights that `config` names. `refine` (icp, point_to_plane or
-    gicp; ten iterations without annealing, else the defaults of `RefineConfig`) improves its poses on
-    the clouds afterwards.
+    `method` is a name of `methods.choose` (without one, that of the released weights that `config`
+    names), whose networks take `methods.AFTER_TRAINING` from `config.model`; or `transforms` is a file
+    of poses. `refine` (icp, point_to_plane or gicp; ten iterations without annealing, else the
+    defaults of `RefineConfig`) improves the poses on the clouds afterwards.
 
     Raises:
-      ValueError: more than one method is chosen, or none; an unknown refinement; missing data,
-        weights or files.
+      ValueError: both or neither of the two are known; an unknown method or refinement; missing
+        data, weights or files.
     """
-    chosen = [x for x in (checkpoint, rienet, method, transforms) if x]
-    if len(chosen) > 1 or not (chosen or config.weights):
-        raise ValueError(
-            "choose one of --checkpoint, --rienet, --method and --transforms; without any, "
-            "--weights or the configuration must name released weights "
-            f"({', '.join(available_weights())})."
-        )
+    name = _evaluated(config, method, transforms)
     improve = _refinement(refine)
     count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
     first: list[Pair] = []
     batches = _keep_first(batches, first)
-    given = _read_transforms(transforms, count) if transforms else None
-    if given is not None and not refine:
-        predicted, seconds = given, None
-        truth = batches.true_transforms(batches)
-        label = f"transforms of {Path(transforms).name}"
+    label = (name or f"transforms of {Path(transforms).name}") + (f" + {refine}" if refine else "")
+    given = None if name else _read_transforms(transforms, count)
+    function = methods.choose(name, model=config.model).batch if name else None
+    if improve is not None:
+        function = improve if function is None else methods.refined_method(function, improve)
+    if function is None:
+        predicted, truth, seconds = given, true_transforms(batches), None
     else:
-        if given is not None:
-            label, function = f"transforms of {Path(transforms).name}", improve
-        elif method:
-            label, function = method, choose_method(method)
-        else:
-            label, function = _network(config, checkpoint, rienet)
-        if refine and given is None:
-            function = methods.refined_method(function, improve)
-        label = f"{label} + {refine}" if refine else label
         with counting_progress(count, label) as progress:
             predicted, truth, seconds = evaluate_method(function, batches, progress, initial=given)
     return Scored(label, dataset_label(config.data, root), predicted, truth, first[0], seconds)
+
+
+def _evaluated(config: Config, method: str, transforms: str) -> str:
+    """The name of what is to be evaluated; empty where transforms are given."""
+    if method and transforms:
+        raise ValueError(
+            f"both a method ({method}) and transforms ({transforms}) are given: choose one of the two."
+        )
+    if not (method or transforms or config.weights):
+        raise ValueError(
+            "nothing to evaluate: choose a method or transforms, or released weights in the "
+            f"configuration. Methods: {', '.join(methods.names())}."
+        )
+    return method or ("" if transforms else f"weights:{config.weights}")
+
+
+def check_given(
+    config: Config, given: Collection[str], *, method: str = "", transforms: str = ""
+) -> None:
+    """Refuse what was set to no effect, so that nobody takes figures for what they are not.
+
+    `given` names the fields of `config` that somebody set, as in `model.k`; the rest is as in
+    `evaluate`.
+
+    Raises:
+      ValueError: one of them changes nothing; says why, and what to give instead.
+    """
+    for name in given:
+        if reason := _without_effect(config, name, method, transforms):
+            raise ValueError(f"{option(config, name)} changes nothing here: {reason}.")
+
+
+def option(config: Config, name: str) -> str:
+    """How a command line sets a field to what it is, as in `--test-pairs.outliers 200`."""
+    section, dot, field = name.rpartition(".")
+    value = getattr(getattr(config, section) if section else config, field)
+    section, field = section.replace("_", "-") + dot, re.sub(r"_(?!$)", "-", field)
+    if isinstance(value, bool):
+        return f"--{section}{'' if value else 'no-'}{field}"
+    values = value if isinstance(value, tuple) else (value,)
+    return " ".join([f"--{section}{field}", *map(str, values)])
+
+
+def _without_effect(config: Config, name: str, method: str, transforms: str) -> str:
+    """Why setting a field changes no evaluation, and what to do; empty where it does."""
+    section, _, field = name.rpartition(".")
+    if section == "pairs":
+        instead = option(config, name).replace("--", "--test-", 1)
+        return f"[pairs] are to train on; to test on such pairs give {instead}"
+    if section in ("loss", "train") or (section == "data" and field in _TRAINING_DATA):
+        return "it belongs to the training; leave it out, or train with it"
+    if name == "weights" and (method or transforms):
+        return f"{method or transforms} is evaluated; leave out one of the two"
+    if section != "model" or not (method or transforms or config.weights):
+        return ""
+    trained = methods.trained_config(_evaluated(config, method, transforms))
+    if trained is None:
+        return f"{method or transforms} is not a network; leave it out"
+    value = getattr(trained.model, field)
+    if field in methods.AFTER_TRAINING or value == getattr(config.model, field):
+        return ""
+    return (
+        f"the weights were trained with {field} = {value}; leave it out, or train with it and evaluate "
+        "that run"
+    )
 
 
 def figures(scored: Scored) -> dict[str, Any]:
     """The metrics of an evaluation (`metrics.summarize`, degrees), and what it was of.
 
     Raises:
-      ValueError: a predicted transform is not finite or no rotation.
+      ValueError: a predicted transform is not finite or not a rotation.
     """
     found = metrics.evaluate_transforms(scored.predicted, scored.truth)
     named = {"method": scored.method, "dataset": scored.dataset}
     return named | found | {"seconds_per_pair": scored.seconds}
-
-
-def score(config: Config, *, save_transforms: str = "", **chosen: Any) -> dict[str, Any]:
-    """The figures of `evaluate`, whose arguments these are; errors as those of both.
-
-    `save_transforms` names an NPZ file for the predicted transforms.
-    """
-    scored = evaluate(config, **chosen)
-    if save_transforms:
-        _save(save_transforms, scored.predicted._asdict())
-    return figures(scored)
 
 
 def _keep_first(

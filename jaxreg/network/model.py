@@ -281,11 +281,13 @@ def register_pair(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],
     *,
-    config: Config,
+    config: Config | ModelConfig,
     source_mask: Bool[Array, "n"] | None = None,
     reference_mask: Bool[Array, "m"] | None = None,
 ) -> Registration:
     """Register two clouds with a trained network; pure: jit, vmap and differentiate it.
+
+    `config` describes the network; of a whole configuration only `model` is read.
 
     Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
     outside a mask are padding and reach nothing, not even as NaN. With no valid point in a cloud
@@ -301,7 +303,7 @@ def register_pair(
     transform, (confidence, copies), _ = iterate(
         variables,
         *clouds,
-        config=config.model,
+        config=config.model if isinstance(config, Config) else config,
         observe=lambda step, graph: (step.confidence, step.matches.copy),
     )
     valid = jnp.any(clouds[0].mask) & jnp.any(clouds[1].mask)

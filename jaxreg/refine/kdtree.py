@@ -89,9 +89,7 @@ def iterate(
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
-    levels = (
-        [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
-    )
+    levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
     # The distance is in the weighting; one of every pair its own would compile every time.
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None

@@ -148,8 +148,7 @@ def test_icl_nuim_and_the_stand_in_of_seven_scenes(tmp_path):
         (folder / f"cloud_bin_{i}.ply").write_text(f"{head}0 0 0\n1 2 {3 + i}\n")
     config = DataConfig(name="seven_scenes", train_draws=3, test_draws=2)
     for split, count in (("train", 3 * 7), ("validation", 3 * 1), ("test", 2 * 2)):
-        with pytest.warns(UserWarning, match="absent: fire.*stand-in split.*Label its figures"):
-            assert len(load_shapes(config, split, root=tmp_path, points=8)[0]) == count
+        assert len(load_shapes(config, split, root=tmp_path, points=8)[0]) == count
 
 
 def test_no_fragment_is_both_trained_on_and_validated(tmp_path):

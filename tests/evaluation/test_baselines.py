@@ -13,7 +13,8 @@ pytest.importorskip("small_gicp", reason="the baselines are not installed", exc_
 
 LOCAL = ("open3d_icp", "open3d_icp_point_to_plane", "open3d_icp_coarse_to_fine", "small_gicp")
 GLOBAL = ("open3d_fgr", "open3d_fpfh_ransac")
-REFINED = ("open3d_fgr_icp", "open3d_fgr_gicp", "open3d_ransac_icp", "open3d_ransac_gicp")
+TUTORIAL = ("open3d_fgr_icp", "open3d_fgr_icp_default", "open3d_ransac_icp")
+REFINED = ("open3d_fgr_gicp", "open3d_ransac_gicp", *TUTORIAL)
 
 
 def shape(rng, n=900):
@@ -65,6 +66,57 @@ def test_normals_turn_with_the_cloud(seed):
     np.testing.assert_allclose(turned, normals @ rotation.T, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", TUTORIAL)
+def test_the_tutorial_takes_features_of_voxels_and_refines_on_all_points(name, seed, monkeypatch):
+    """On scans that are much denser than the voxels; and one that is not stays as it is."""
+    described, refined = [], []
+    fpfh, to_plane = open3d._fpfh, open3d._to_plane
+    monkeypatch.setattr(
+        open3d, "_fpfh", lambda cloud, s: described.append(len(cloud.points)) or fpfh(cloud, s)
+    )
+    monkeypatch.setattr(
+        open3d,
+        "_to_plane",
+        lambda x, y, *rest: refined.append((len(x.points), len(y.points))) or to_plane(x, y, *rest),
+    )
+    rng = np.random.default_rng(seed)
+    source, reference = shape(rng, 12_000), shape(rng, 10_000)
+    rotation = Rotation.from_euler("xyz", [30, 50, 20], degrees=True).as_matrix()
+    truth = RigidTransform(rotation, np.array([0.3, 0.0, -0.2]))
+    found = choose(name)(source, reference @ rotation.T + truth.translation, spacing=0.1)
+    assert errors(found, truth)["mie_r_deg"] < 1
+    voxels = [len(np.unique(np.floor(x / 0.1), axis=0)) for x in (source, reference)]
+    assert described == pytest.approx(voxels, rel=0.15)
+    assert refined == [(12_000, 10_000)]
+    described.clear()
+    choose(name)(source[:900], reference[:800], spacing=0.05)
+    assert described == [900, 800]
+
+
+def test_fgr_is_run_as_its_authors_do_and_as_open3d_does(seed, monkeypatch):
+    given = []
+    registration = open3d._registration()
+    option = registration.FastGlobalRegistrationOption
+    monkeypatch.setattr(
+        registration,
+        "FastGlobalRegistrationOption",
+        lambda **options: given.append(options) or option(**options),
+    )
+    source, reference, _ = make_pair(seed, 5)
+    for name in ("open3d_fgr", "open3d_fgr_gicp", "open3d_fgr_icp", "open3d_fgr_icp_default"):
+        choose(name)(source, reference)
+    assert [options["decrease_mu"] for options in given] == [True, True, True, False]
+    assert {options["maximum_correspondence_distance"] for options in given} == {0.025}
+    assert option().decrease_mu is False, "what the default row is named after"
+
+
+def test_kiss_matcher_finds_a_large_motion(seed):
+    pytest.importorskip("kiss_matcher", reason="the baselines are not installed")
+    source, reference, truth = make_pair(seed, 120)
+    result = errors(choose("kiss_matcher_icp@0.1")(source, reference), truth)
+    assert result["recall_1deg"] == 1
+
+
 @pytest.mark.parametrize("name", LOCAL + GLOBAL + REFINED)
 def test_sizes_differ_and_the_same_call_gives_the_same_transform(name, seed):
     source, reference, truth = make_pair(seed, 5)
@@ -74,7 +126,7 @@ def test_sizes_differ_and_the_same_call_gives_the_same_transform(name, seed):
     assert errors(first, truth)["recall_5deg"] == 1
 
 
-@pytest.mark.parametrize("name", ["open3d_fgr_gicp", "small_gicp"])
+@pytest.mark.parametrize("name", ["open3d_fgr_gicp", "open3d_ransac_icp", "small_gicp"])
 def test_spacing_is_the_only_length(name, seed):
     source, reference, truth = make_pair(seed, 5)
     scaled = choose(name)(100 * source, 100 * reference, spacing=5.0)

@@ -9,7 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.config import ModelConfig, PairConfig
-from jaxreg.data.batches import pair_batches, test_key
+from jaxreg.data.batches import (
+    given_pair_batches,
+    key_of_tests,
+    pair_batches,
+    true_transforms,
+)
 from jaxreg.evaluation import methods, run
 from jaxreg.network.model import init_variables
 from jaxreg.refine.config import RefineConfig
@@ -26,7 +31,7 @@ def shapes(seed):
 
 
 def batches(shapes, batch):
-    return pair_batches(shapes, test_key(3), config=PAIRS, batch=batch)
+    return pair_batches(shapes, key_of_tests(3), config=PAIRS, batch=batch)
 
 
 def test_pairs_do_not_depend_on_the_size_of_the_batch(shapes):
@@ -49,7 +54,7 @@ def test_every_pair_is_counted_once_with_its_own_truth(shapes):
     assert sum(done) == 5
     assert predicted.rotation.shape == (5, 3, 3)
     jax.tree.map(np.testing.assert_array_equal, predicted, truth)
-    jax.tree.map(np.testing.assert_array_equal, truth, batches.true_transforms(batches(shapes, 3)))
+    jax.tree.map(np.testing.assert_array_equal, truth, true_transforms(batches(shapes, 3)))
     assert seconds >= 0
 
 
@@ -124,8 +129,8 @@ def test_a_host_method_sees_valid_points_only(shapes):
 def test_icp_undoes_a_small_motion(seed):
     shapes = np.random.default_rng(seed).normal(size=(2, 64, 3)).astype(np.float32)
     easy = PairConfig(points=64, kept=64, crop="none", rotation_max_deg=3.0, translation_max=0.02)
-    stream = pair_batches(shapes, test_key(0), config=easy, batch=2)
-    predicted, truth, _ = run.evaluate_method(methods.icp_method, stream)
+    stream = pair_batches(shapes, key_of_tests(0), config=easy, batch=2)
+    predicted, truth, _ = run.evaluate_method(methods.choose("icp").batch, stream)
     np.testing.assert_allclose(predicted.rotation, truth.rotation, atol=1e-4)
     np.testing.assert_allclose(predicted.translation, truth.translation, atol=1e-4)
 
@@ -134,7 +139,7 @@ def test_icp_undoes_a_small_motion(seed):
 def test_a_refinement_mends_poses_that_are_nearly_right(method, seed):
     shapes = np.random.default_rng(seed).normal(size=(2, 64, 3)).astype(np.float32)
     easy = PairConfig(points=64, kept=64, crop="none", rotation_max_deg=30.0)
-    stream = list(pair_batches(shapes, test_key(0), config=easy, batch=2))
+    stream = list(pair_batches(shapes, key_of_tests(0), config=easy, batch=2))
 
     def nearly(pair):
         return pair.transform._replace(translation=pair.transform.translation + 0.02)
@@ -178,16 +183,16 @@ def test_given_pairs_keep_their_pose_and_are_cropped(seed):
     target = np.einsum("nij,npj->npi", matrices[:, :3, :3], source) + matrices[:, None, :3, 3]
     config = PairConfig(kept=12)
     counted = list(
-        batches.given_pair_batches(
+        given_pair_batches(
             (source, target.astype(np.float32)),
             matrices,
-            test_key(0),
+            key_of_tests(0),
             config=config,
             batch=2,
         )
     )
     assert [count for _, count in counted] == [2, 1]
-    truth = batches.true_transforms(iter(counted))
+    truth = true_transforms(iter(counted))
     np.testing.assert_allclose(truth.rotation, matrices[:, :3, :3], atol=1e-6)
     np.testing.assert_allclose(truth.translation, matrices[:, :3, 3], atol=1e-6)
     pair, _ = counted[0]

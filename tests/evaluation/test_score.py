@@ -1,19 +1,15 @@
 """One score for every method: names, files of transforms, and what is refused."""
 
 import dataclasses
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.cli import evaluate, process
-from jaxreg.config import Config, ModelConfig, PairConfig, from_dict, load_config
+from jaxreg.config import PairConfig, from_dict
+from jaxreg.data.batches import true_transforms
 from jaxreg.evaluation import score
-from jaxreg.weights.checkpoint import open_run
 from tests.data.test_icl_nuim import write_published
 
 pytestmark = pytest.mark.float32
@@ -28,15 +24,21 @@ def config():
     )
 
 
+def scored(config, **options):
+    return score.figures(score.evaluate(config, **options))
+
+
 def test_transforms_of_another_program_are_scored_like_our_own(config, tmp_path):
     saved = tmp_path / "identity.npz"
-    ours = score.score(config, method="identity", batch=2, save_transforms=str(saved))
-    theirs = score.score(config, transforms=str(saved), batch=3)
+    found = score.evaluate(config, method="identity", batch=2)
+    score.save_transforms(saved, found.predicted)
+    ours = score.figures(found)
+    theirs = scored(config, transforms=str(saved), batch=3)
     assert ours["pairs"] == theirs["pairs"] == 3
     metrics = [name for name in ours if name not in ("method", "seconds_per_pair")]
     assert {name: ours[name] for name in metrics} == {name: theirs[name] for name in metrics}
     # The identity is wrong by the angle of each true rotation, and by the true translation.
-    truth = score.evaluation.true_transforms(score.pair_stream(config, root=None)[1])
+    truth = true_transforms(score.pair_stream(config, root=None)[1])
     angles = np.degrees(np.arccos((np.trace(truth.rotation, axis1=1, axis2=2) - 1) / 2))
     assert ours["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-4)
     assert ours["mae_t"] == pytest.approx(np.abs(truth.translation).mean(), rel=1e-5)
@@ -44,9 +46,9 @@ def test_transforms_of_another_program_are_scored_like_our_own(config, tmp_path)
 
 def test_refined_transforms_of_another_program_are_those_of_the_refined_method(config, tmp_path):
     saved = str(tmp_path / "identity.npz")
-    score.score(config, method="identity", save_transforms=saved)
-    ours = score.score(config, method="identity", refine="icp", batch=2)
-    theirs = score.score(config, transforms=saved, refine="icp", batch=2)
+    score.save_transforms(saved, score.evaluate(config, method="identity").predicted)
+    ours = scored(config, method="identity", refine="icp", batch=2)
+    theirs = scored(config, transforms=saved, refine="icp", batch=2)
     assert theirs["method"] == "transforms of identity.npz + icp"
     assert theirs["seconds_per_pair"] > 0
     metrics = [name for name in ours if name not in ("method", "seconds_per_pair")]
@@ -61,16 +63,16 @@ def test_refinement_leaves_a_right_pose_where_it_is(config, tmp_path, refine):
         data=dataclasses.replace(config.data, test_shapes=12),
         test_pairs=PairConfig(points=256, kept=192),
     )
-    truth = score.evaluation.true_transforms(score.pair_stream(partial, root=None)[1])
+    truth = true_transforms(score.pair_stream(partial, root=None)[1])
     np.savez(tmp_path / "true.npz", **truth._asdict())
-    found = score.score(partial, transforms=str(tmp_path / "true.npz"), refine=refine)
+    found = scored(partial, transforms=str(tmp_path / "true.npz"), refine=refine)
     assert found["worst_rre_deg"] < 0.01
 
 
 def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
     _, stream = score.pair_stream(config, root=None, batch=2)
     score.save_pairs(str(tmp_path / "pairs.npz"), stream)
-    truth = score.evaluation.true_transforms(score.pair_stream(config, root=None)[1])
+    truth = true_transforms(score.pair_stream(config, root=None)[1])
     with np.load(tmp_path / "pairs.npz", allow_pickle=False) as pairs:
         source, reference = pairs["source"][0], pairs["reference"][0]
     moved = source @ truth.rotation[0].T + truth.translation[0]
@@ -81,32 +83,32 @@ def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "icp", "checkpoint": "x"}, "choose one of"),
-        ({}, "choose one of"),
-        ({"method": "magic"}, "magic"),
+        ({"method": "icp", "transforms": "x"}, "both a method .* are given: choose one"),
+        ({}, "nothing to evaluate: .*Methods: identity, icp, register"),
+        ({"method": "magic"}, "no method 'magic': choose one of identity"),
         ({"method": "icp", "refine": "magic"}, "no refinement 'magic': choose one of icp"),
         ({"transforms": "nowhere.npz"}, "no file nowhere.npz: give an NPZ file with"),
         ({"transforms": str(ROOT / "LICENSE")}, "LICENSE is no .npz of arrays"),
-        ({"checkpoint": "nowhere"}, "no checkpoint in nowhere"),
+        ({"method": "checkpoint:nowhere"}, "no checkpoint in nowhere"),
     ],
 )
 def test_what_cannot_be_scored_says_why(config, options, message):
     with pytest.raises(ValueError, match=message):
-        score.score(config, **options)
+        scored(config, **options)
 
 
 def test_transforms_of_the_wrong_number_are_refused(config, tmp_path):
     np.savez(tmp_path / "two.npz", rotation=np.zeros((2, 3, 3)), translation=np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"3 pairs need rotation \(3, 3, 3\)"):
-        score.score(config, transforms=str(tmp_path / "two.npz"))
+        scored(config, transforms=str(tmp_path / "two.npz"))
     np.savez(tmp_path / "text.npz", rotation=np.full((3, 3, 3), "1"), translation=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="`rotation` is of type <U1: give an NPZ file"):
-        score.score(config, transforms=str(tmp_path / "text.npz"), refine="icp")
+        scored(config, transforms=str(tmp_path / "text.npz"), refine="icp")
 
 
 def test_a_refined_method_says_so_and_is_better(config):
     easy = dataclasses.replace(config, test_pairs=PairConfig(32, crop="none", rotation_max_deg=3))
-    plain, refined = (score.score(easy, method="identity", refine=refine) for refine in ("", "icp"))
+    plain, refined = (scored(easy, method="identity", refine=refine) for refine in ("", "icp"))
     assert refined["method"] == "identity + icp"
     assert refined["mie_r_deg"] < plain["mie_r_deg"]
 
@@ -115,7 +117,7 @@ def test_a_refined_method_says_so_and_is_better(config):
 def test_the_methods_for_any_rotation_are_scored_by_name(config, method):
     pairs = PairConfig(512, kept=400, sampling="disjoint", rotation="full")
     easy = dataclasses.replace(config, test_pairs=pairs)
-    result = score.score(easy, method=method, pairs=1)
+    result = scored(easy, method=method, pairs=1)
     assert result["method"] == method
     # Two samplings of a shape of the configuration that share no point.
     assert result["mie_r_deg"] < 5
@@ -126,245 +128,9 @@ def test_pairs_of_a_file_are_scored_in_their_own_pose(tmp_path):
     config = from_dict(
         {"data": {"name": "icl_nuim", "test_pairs_from": "file"}, "test_pairs": {"kept": 30}}
     )
-    result = score.score(config, root=tmp_path, method="identity", pairs=4)
+    result = scored(config, root=tmp_path, method="identity", pairs=4)
     angles = np.degrees(Rotation.from_matrix(arrays["transform"][:4, :3, :3]).magnitude())
     assert (result["dataset"], result["pairs"]) == ("rooms", 4)
     assert result["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-5)
     with pytest.raises(ValueError, match="needs data.name = 'icl_nuim'"):
-        score.score(from_dict({"data": {"test_pairs_from": "file"}}), method="icp")
-
-
-def run(script, *arguments):
-    command = [sys.executable, str(ROOT / script), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
-
-
-def test_the_command_prints_a_table_and_writes_the_figures(tmp_path):
-    out = tmp_path / "r.json"
-    toml = tmp_path / "c.toml"
-    toml.write_text('[data]\nname = "shapes"\ntest_shapes = 2\n[pairs]\npoints = 32\nkept = 24\n')
-    done = run("evaluate.py", toml, "--method", "identity", "--json", out)
-    assert done.returncode == 0, done.stderr
-    assert "MAE(R) deg" in done.stdout
-    figures = json.loads(out.read_text())
-    names = {"method", "config", "dataset", "pairs", "mae_r_deg", "mae_t", "mie_r_deg"}
-    names |= {"mie_r_deg_float32_acos", "mie_t", "median_rre_deg", "median_rte"}
-    assert names | {"recall_1deg", "recall_5deg", "seconds_per_pair"} <= set(figures)
-
-
-@pytest.fixture
-def toml(tmp_path):
-    path = tmp_path / "c.toml"
-    path.write_text(
-        'weights = "modelnet40"\n[data]\nname = "shapes"\ntest_shapes = 3\n'
-        "[pairs]\npoints = 32\nkept = 24\n[model]\nn_inliers = 16\n"
-    )
-    return path
-
-
-@pytest.fixture
-def command(toml, monkeypatch, capsys):
-    """evaluate.py in this process and in the folder of its files: status, what it prints, its error."""
-    monkeypatch.setattr(process, "enable_compilation_cache", lambda: None)
-    monkeypatch.chdir(toml.parent)
-
-    def run(*options):
-        status = 0
-        try:
-            status = evaluate.main(["c.toml", *options])
-        except SystemExit as end:
-            status = end.code
-        return status, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
-def asked(monkeypatch):
-    """The configurations that are to be evaluated; none is."""
-    configs = []
-
-    def evaluate_not(config, **_):
-        configs.append(config)
-        raise ValueError("not here")
-
-    monkeypatch.setattr(score, "evaluate", evaluate_not)
-    return configs
-
-
-@pytest.mark.parametrize("refine", [(), ("--refine", "icp")])
-def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monkeypatch, refine):
-    drawn, loads = [], []
-    load = score.load_shapes
-    monkeypatch.setattr(score, "load_shapes", lambda *a, **k: loads.append(a) or load(*a, **k))
-    monkeypatch.setattr(score, "plot_pair", lambda *a, truth: drawn.append((*a, truth)))
-    turns = Rotation.from_euler("z", [[3], [4], [5]], degrees=True).as_matrix().astype(np.float32)
-    np.savez("mine.npz", rotation=turns, translation=np.ones((3, 3), np.float32))
-    options = ("--transforms", "mine.npz", *refine, "--picture", "first.png")
-    status, _, error = command(*options, "--save-transforms", "scored.npz")
-    assert (status, error) == (0, "")
-    assert len(loads) == 1, "neither data nor weights are loaded again"
-    [(source, reference, transform, path, truth)] = drawn
-    with np.load("scored.npz") as scored:
-        np.testing.assert_array_equal(transform.rotation, scored["rotation"][0])
-        np.testing.assert_array_equal(transform.translation, scored["translation"][0])
-    assert np.allclose(transform.rotation, turns[0]) == (not refine)
-    assert (str(path), source.shape, reference.shape) == ("first.png", (24, 3), (24, 3))
-    truths = score.evaluation.true_transforms(score.pair_stream(config, root=None)[1])
-    np.testing.assert_array_equal(truth.rotation, truths.rotation[0])
-    moved = source @ truth.rotation.T + truth.translation
-    distance = np.linalg.norm(moved[:, None] - reference[None], axis=2).min(axis=1)
-    assert np.mean(distance < 1e-5) > 0.5, "most points of a pair are exact copies"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--picture out.xyz", "--picture out.xyz: name a file that ends in .png or .pdf or .svg"),
-        ("--save-transforms out", "--save-transforms out: name a file that ends in .npz"),
-        ("--save-pairs out.npy", "--save-pairs out.npy: name a file that ends in .npz"),
-        ("--json .", ". is a directory: name a file in it"),
-        (
-            "--json nowhere/out.json",
-            "nowhere/out.json: the folder nowhere does not exist: make it first",
-        ),
-        ("--json c.toml", "c.toml is read or written by this command already"),
-        ("--transforms x.npz --save-pairs x.npz", "x.npz is read or written by this command"),
-        ("--save-pairs x.npz --save-transforms x.npz", "x.npz is read or written by this command"),
-    ],
-)
-def test_an_output_that_cannot_be_written_is_refused_before_the_work(
-    command, asked, options, message
-):
-    status, printed, error = command(*options.split())
-    assert (status, printed, asked) == (2, "", [])
-    assert error.startswith(f"error: {message}")
-    assert len(error.splitlines()) == 1
-
-
-def test_the_figures_are_out_before_anything_that_may_fail(command, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device", "first.png")
-
-    monkeypatch.setattr(score, "plot_pair", full)
-    options = "--method identity --json out.json --save-pairs p.npz --picture first.png"
-    status, printed, error = command(*options.split())
-    assert (status, error) == (2, "error: first.png: No space left on device\n")
-    assert "MAE(R) deg" in printed
-    assert json.loads(Path("out.json").read_text())["pairs"] == 3
-    assert Path("p.npz").is_file()
-
-
-def test_poses_that_are_none_are_written_all_the_same(command, monkeypatch):
-    """Of minutes of work, to see which they are."""
-    broken = score.RigidTransform(np.full((3, 3, 3), np.nan), np.zeros((3, 3)))
-    monkeypatch.setattr(score.evaluation, "identity_method", lambda pair: broken)
-    status, _, error = command("--method", "identity", "--save-transforms", "out.npz")
-    assert status == 2
-    assert error.startswith("error: the predicted transform of pair 0 is not finite")
-    with np.load("out.npz") as written:
-        assert np.isnan(written["rotation"]).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--pairs.outliers 200", "to test on such pairs give --test-pairs.outliers 200"),
-        ("--pairs.outliers=0", "to test on such pairs give --test-pairs.outliers 0"),
-        ("--pairs.independent-crops", "to test on such pairs give --test-pairs.independent-crops"),
-        ("--loss.lambda_ 0", "it belongs to the training"),
-        ("--train.steps 5", "it belongs to the training"),
-        ("--data.train-shapes 5", "it belongs to the training"),
-        ("--model.k 12", "the weights were trained with k = 5; leave it out"),
-        ("--model.include_self", "the weights were trained with include_self = False"),
-        ("--method icp --model.iterations 5", "--method evaluates no network; leave it out"),
-        ("--method icp --weights modelnet40", "--method says what is evaluated"),
-        ("--checkpoint run --model.k 12", "the weights were trained with k = 7"),
-    ],
-)
-def test_an_option_without_effect_is_refused(command, asked, options, message):
-    if "--checkpoint" in options:
-        write_run("run")
-    status, printed, error = command(*options.split())
-    assert (status, printed, asked) == (2, "", [])
-    idle = next(word for word in options.split()[::-1] if word.startswith("--"))
-    assert error.startswith(f"error: {idle.partition('=')[0]} changes nothing here: ")
-    assert message in error
-    assert len(error.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "section", "changed"),
-    [
-        ("", "model", {}),
-        ("--test-pairs.outliers 200", "test_pairs", {"outliers": 200}),
-        ("--model.iterations 5 --model.k 5", "model", {"iterations": 5}),
-        ("--data.test-shapes 2 --pairs 1", "data", {"test_shapes": 2}),
-        ("--checkpoint run", "model", {"iterations": 5}),
-        ("--checkpoint run --model.k 7", "model", {"k": 7, "iterations": 5}),
-        ("--checkpoint run --model.iterations 3", "model", {}),
-        ("--checkpoint run --model.n-inliers 9", "model", {"n_inliers": 9, "iterations": 5}),
-    ],
-)
-def test_released_weights_follow_the_file_and_a_run_its_training(
-    command, asked, toml, options, section, changed
-):
-    """The command line has the last word on either, also where it says what the file says."""
-    if "--checkpoint" in options:
-        write_run("run")
-    _, printed, error = command(*options.split())
-    assert error == "error: not here\n"
-    file = load_config(toml)
-    expected = dataclasses.replace(getattr(file, section), **changed)
-    assert asked == [dataclasses.replace(file, **{section: expected})]
-    told = "--checkpoint" in options and "iterations" in changed
-    assert ("model.iterations = 5 as run was trained, not 3 as in c.toml" in printed) == told
-    assert told or printed == ""
-
-
-def write_run(workdir):
-    """A run of train.py as far as its configuration: another network, five iterations."""
-    config = Config(model=ModelConfig(k=7, iterations=5, n_inliers=16))
-    with open_run(workdir, config) as run:
-        run.save(1, {"nothing": np.zeros(1)}, 0.5)
-
-
-@pytest.mark.parametrize("option", ["--transforms", "--rienet"])
-@pytest.mark.parametrize("content", [None, b"", b"PK\x03\x04cut"])
-def test_a_file_that_cannot_be_read_is_one_line_and_status_2(command, option, content):
-    path = Path("mine.npz")
-    if content is None:
-        path.mkdir()
-    else:
-        path.write_bytes(content)
-    status, _, error = command(option, "mine.npz")
-    assert status == 2
-    assert error.startswith("error: mine.npz is ")
-    assert len(error.splitlines()) == 1
-
-
-def test_procedural_shapes_need_no_folder_of_data_sets(command, monkeypatch):
-    monkeypatch.setenv("JAXREG_DATA", "/unmounted")
-    assert command("--method", "identity")[0] == 0
-    status, _, error = command("--method", "identity", "--data.name", "modelnet40")
-    assert status == 2
-    assert "$JAXREG_DATA names /unmounted, which is no folder" in error
-
-
-def test_a_mistake_on_the_command_line_is_one_line(tmp_path):
-    toml = tmp_path / "c.toml"
-    toml.write_text("[model]\nalpah = 1.0\n")
-    done = run("evaluate.py", toml)
-    assert done.returncode == 2
-    assert "did you mean 'alpha'" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
-def test_data_that_is_not_there_is_one_line_and_status_2(tmp_path, script):
-    toml = tmp_path / "c.toml"
-    toml.write_text('[data]\nname = "modelnet40"\n')
-    done = run(script, toml, "--data-root", tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: ")
-    assert len(done.stderr.splitlines()) == 1
+        scored(from_dict({"data": {"test_pairs_from": "file"}}), method="icp")
