@@ -38,7 +38,9 @@ POINTS = 1024
 VIEW = (18.0, -55.0)
 RIGHT, WRONG = "#1f9d55", "#d23c3c"
 DRAWN = 4  # Every fourth wrong candidate: all of them would hide the clouds.
-RIGHT_WITHIN = 0.1  # A candidate whose points lie so near each other is right, in units of the search.
+RIGHT_WITHIN = (
+    0.1  # A candidate whose points lie so near each other is right, in units of the search.
+)
 CONFIG = SearchConfig()
 
 
@@ -119,9 +121,7 @@ def _draw_candidates(axes: Axes, stages: Stages) -> None:
     axes.scatter(*right.T, s=6, lw=0, color=pictures.REFERENCE)
     axes.set(xticks=[], yticks=[], aspect="equal")
     axes.spines[:].set_visible(False)
-    axes.set_title(
-        f"1, 2   {len(stages.right)} candidates, {stages.right.sum()} right (green)"
-    )
+    axes.set_title(f"1, 2   {len(stages.right)} candidates, {stages.right.sum()} right (green)")
 
 
 def _draw_poses(axes: Axes, stages: Stages) -> None:
@@ -169,7 +169,9 @@ def _draw_result(axes: Axes, stages: Stages) -> None:
     ]
     everything = np.concatenate([stages.reference, aligned])
     pictures.draw_clouds(axes, clouds, VIEW, pictures.project(everything, VIEW))
-    axes.set_title(f"8   the best one, refined: {stages.found_angle_deg:.1f} degrees from the truth")
+    axes.set_title(
+        f"8   the best one, refined: {stages.found_angle_deg:.1f} degrees from the truth"
+    )
 
 
 def _angles_deg(poses: RigidTransform, truth: RigidTransform) -> jax.Array:
