@@ -158,7 +158,9 @@ def search_poses(
     (radians) are not allowed.
     """
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
-    also = None if also is None else frame.transform_in(where, also)
+    if also is not None:
+        _check_transform(also)
+        also = frame.transform_in(where, also)
     found = search_described(
         describe(x, source_mask, unit=1.0, config=config),
         describe(y, reference_mask, unit=1.0, config=config),
@@ -236,14 +238,19 @@ def _check_search(source: Described, reference: Described, similarity, also, max
             f"similarity must have shape {(n, m)}, a row for every source point and a column for every "
             f"reference point, got {similarity.shape}."
         )
-    if also is not None and (also.rotation.shape, also.translation.shape) != ((3, 3), (3,)):
-        raise ValueError(
-            f"also must be one transform with a rotation (3, 3) and a translation (3,), got "
-            f"{also.rotation.shape} and {also.translation.shape}."
-        )
+    if also is not None:
+        _check_transform(also)
     if not isinstance(max_angle, jax.core.Tracer) and not 0 < max_angle <= math.pi + 1e-6:
         raise ValueError(
             f"max_angle = {max_angle}: give an angle in (0, pi], in radians (np.radians(degrees))."
+        )
+
+
+def _check_transform(also: RigidTransform) -> None:
+    if (also.rotation.shape, also.translation.shape) != ((3, 3), (3,)):
+        raise ValueError(
+            f"also must be one transform with a rotation (3, 3) and a translation (3,), got "
+            f"{also.rotation.shape} and {also.translation.shape}."
         )
 
 
