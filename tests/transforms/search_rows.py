@@ -18,6 +18,7 @@ from jaxreg.search import (
     nearest,
     pipeline,
     ranking,
+    stages,
     surface,
 )
 from jaxreg.search.config import SearchConfig
@@ -78,16 +79,16 @@ def compared(one, other):
 
 
 def searched(one, other, mask, max_angle):
-    return pipeline.search_described(
+    return stages.search_described(
         described(one, mask), described(other, jnp.asarray(ALL)), max_angle=max_angle, config=CONFIG
     )
 
 
 def search_rows() -> dict[str, Row]:
-    return {f"search.{name}": row for name, row in (stages() | descriptions() | whole()).items()}
+    return {f"search.{name}": row for name, row in (parts() | descriptions() | whole()).items()}
 
 
-def stages() -> dict[str, Row]:
+def parts() -> dict[str, Row]:
     x, y, moved = points(), points(), surface_of(points())
     agree = RNG.uniform(size=(N, N))
     agree = (agree + agree.T) / 2
@@ -226,7 +227,7 @@ def whole() -> dict[str, Row]:
         "pipeline.enter": Row(
             entered, (x, y, ALL), tuple((c, c, ALL) for c in clouds_that_break().values())
         ),
-        "pipeline.search_described": Row(searched, (x, y, ALL, bound), broken, smooth=False),
+        "stages.search_described": Row(searched, (x, y, ALL, bound), broken, smooth=False),
         "pipeline.search_poses": Row(
             poses_of(pipeline.search_poses), (x, y, ALL, bound), broken, smooth=False
         ),

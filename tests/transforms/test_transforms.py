@@ -36,6 +36,7 @@ HOST |= {"geometry.rigid.rotation_angle_deg", "geometry.rigid.nearest_rotation"}
 HOST |= {"geometry.frame.measure"}
 HOST |= {"search.learned.load_features", "search.learned.feature_config"}
 HOST |= {"search.learned.check_network", "search.description.check_cloud"}
+HOST |= {"search.stages.check_transform"}
 HOST |= {"search.learned.init_network"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
@@ -78,6 +79,7 @@ ROOMS = (
     "search.nearest",
     "search.pipeline",
     "search.ranking",
+    "search.stages",
     "search.surface",
 )
 
