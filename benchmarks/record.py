@@ -73,14 +73,17 @@ def write(
 
 
 def command(module: str) -> str:
-    """The command line of this process as one that makes the record again: without a path to data."""
+    """The command line of this process as one that makes the record again, elsewhere.
+
+    `--data-root` is left out, and of other absolute paths all but the name.
+    """
     given = iter(sys.argv[1:])
     kept = []
     for word in given:
         if word == "--data-root":
             next(given, None)
         elif not word.startswith("--data-root="):
-            kept.append(word)
+            kept.append(Path(word).name if word.startswith("/") else word)
     return shlex.join(["python", "-m", module, *kept])
 
 

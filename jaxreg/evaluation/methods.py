@@ -3,6 +3,7 @@
 `choose` is the one way from a name to a method: evaluation and every benchmark go through it.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
