@@ -8,7 +8,10 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
+import shlex
 import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -67,6 +70,26 @@ def write(
     text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False, default=_plain)
     path.write_text(text + "\n", encoding="utf-8")
     return path
+
+
+def command(module: str) -> str:
+    """The command line of this process as one that makes the record again, elsewhere.
+
+    `--data-root` is left out, and of other absolute paths all but the name.
+    """
+    given = iter(sys.argv[1:])
+    kept = []
+    for word in given:
+        if word == "--data-root":
+            next(given, None)
+        elif not word.startswith("--data-root="):
+            kept.append(Path(word).name if word.startswith("/") else word)
+    return shlex.join(["python", "-m", module, *kept])
+
+
+def key(name: str) -> str:
+    """A name as a template can say it: `open3d_ransac_icp@0.05` is `open3d_ransac_icp_0_05`."""
+    return re.sub(r"\W", "_", name)
 
 
 def commit() -> str:

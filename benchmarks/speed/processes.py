@@ -70,7 +70,7 @@ def first_results(task: str, **options) -> tuple[dict, dict]:
 
 def train(points: int, batch: int, rounds: int, seconds: float) -> dict:
     """The candidates of the training step, in turns."""
-    from benchmarks.scans import candidates
+    from benchmarks.speed import candidates
 
     return {"rows": candidates.train(points, batch=batch, rounds=rounds, seconds=seconds)}
 

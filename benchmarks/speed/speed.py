@@ -31,8 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.paper import accuracy
-from benchmarks.scans import candidates
-from benchmarks.speed import processes, stages
+from benchmarks.speed import candidates, processes, stages
 from jaxreg.cli.process import restart_with_huge_pages
 
 Part = Literal["forward", "training", "stages", "programs", "first", "accuracy"]

@@ -3,6 +3,7 @@
 `choose` is the one way from a name to a method: evaluation and every benchmark go through it.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -187,8 +188,7 @@ def _global(network: Network | None) -> Callable[[PointCloud, PointCloud], Rigid
 
 def _registered(source: np.ndarray, reference: np.ndarray) -> Outcome:
     found = register(source, reference)
-    transform = RigidTransform(found.rotation, found.translation)
-    return Outcome(transform, found.success, found.probability)
+    return Outcome(found.transform, found.success, found.probability)
 
 
 def _traced(one: Callable[[PointCloud, PointCloud], RigidTransform]) -> Method:

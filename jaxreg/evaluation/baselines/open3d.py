@@ -11,15 +11,13 @@ add a refinement within 2 and then 0.6 of it that runs until it has converged. `
 and `fgr_icp_default` are the tutorial: features of voxels of `spacing`, then point-to-plane ICP on the
 whole clouds with Open3D's own criteria.
 
-What differs from the tutorial is to Open3D's advantage, as measured:
-
-* Normals point away from the centre of the cloud: see `_oriented`.
-* Clouds that are no denser than the voxels stay as they are, instead of losing every fifth point.
-* ICP pairs points within 2 and then 1 of `spacing`; the tutorial's single 0.4 suits scans whose points
-  lie much denser than the voxels, and there it ends in the same poses.
-* FGR has `decrease_mu`, as its authors' own program (https://github.com/isl-org/FastGlobalRegistration).
-  Open3D's default for Python is without, where the distance has no effect and every outlier keeps its
-  pull; that, as in the tutorial, is `fgr_icp_default`.
+What differs from the tutorial is to Open3D's advantage, as measured. Normals point away from the
+centre of the cloud: see `_oriented`. Clouds that are no denser than the voxels (`_are_dense`) stay as
+they are, instead of losing every fifth point, and their ICP pairs points within 2 and then 1 of
+`spacing` in place of 0.4, within which most of their points have no neighbour. FGR has `decrease_mu`,
+as in its authors' own program (https://github.com/isl-org/FastGlobalRegistration); Open3D's default for
+Python is without, where the distance has no effect and every outlier keeps its pull. That, as in the
+tutorial, is `fgr_icp_default`.
 
 Every function takes a source (n, 3) and a reference (m, 3) and raises ValueError when a cloud is
 not finite, not (n, 3), or has fewer than three points, and when Open3D is not installed. Random
@@ -258,21 +256,29 @@ def _tutorial(
     seed: int,
 ) -> RigidTransform:
     """A coarse pose of the thinned clouds, refined on the whole ones."""
-    whole = _clouds(source, reference, spacing)
-    thinned = (_thinned(cloud, spacing) for cloud in whole)
-    return _transform(_to_plane(*whole, coarse(*thinned, spacing, seed), spacing))
+    whole = features = _clouds(source, reference, spacing)
+    if _are_dense(*whole, spacing):
+        features = (_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole)
+    return _transform(_to_plane(*whole, coarse(*features, spacing, seed), spacing))
 
 
-def _thinned(cloud: Any, spacing: float) -> Any:
-    voxels = cloud.voxel_down_sample(spacing)
-    return _oriented(voxels, spacing) if 2 * len(voxels.points) < len(cloud.points) else cloud
+def _are_dense(source: Any, reference: Any, spacing: float) -> bool:
+    """Whether both clouds have more than two points a voxel, as scans do in the tutorial."""
+    return all(
+        2 * len(cloud.voxel_down_sample(spacing).points) < len(cloud.points)
+        for cloud in (source, reference)
+    )
 
 
 def _to_plane(source: Any, reference: Any, initial: np.ndarray, spacing: float) -> np.ndarray:
     module = _registration()
-    for distance in (2 * spacing, spacing):
+    for distance in (0.4,) if _are_dense(source, reference, spacing) else (2, 1):
         initial = module.registration_icp(
-            source, reference, distance, initial, module.TransformationEstimationPointToPlane()
+            source,
+            reference,
+            distance * spacing,
+            initial,
+            module.TransformationEstimationPointToPlane(),
         ).transformation
     return initial
 
