@@ -18,8 +18,8 @@ def squared_distances(
     points: Float[Array, "n 3"], others: Float[Array, "m 3"]
 ) -> Float[Array, "n m"]:
     """``d[i, j] = |points[i] - others[j]|^2``."""
-    differences = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
-    return sum(d * d for d in differences)
+    x, y, z = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
+    return x * x + y * y + z * z
 
 
 def without_padding(
