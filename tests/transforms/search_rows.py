@@ -183,13 +183,13 @@ def descriptions() -> dict[str, Row]:
             of_cloud(lambda x, _, d, m: jnp.abs(descriptors.gaussian_normals(x, d, m, radius=2.0))),
             (x, normals, ALL),
             broken,
-            kinks=True,
+            smooth=False,
         ),
         "descriptors.moments": Row(
             of_cloud(functools.partial(descriptors.moments, radii=(3.0, 5.0))),
             (x * [1.5, 1.0, 0.5], normals, ALL),
             broken,
-            kinks=True,
+            smooth=False,
         ),
         "descriptors.openness": Row(
             of_cloud(functools.partial(descriptors.openness, radius=2.0)), (x, normals, ALL), broken
