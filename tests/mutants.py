@@ -20,7 +20,10 @@ ROOT = Path(__file__).parent.parent
 
 
 class Mutant(NamedTuple):
-    """Where `text` of `module` becomes `mutated`, `test` of that module's tests must fail."""
+    """Where `text` of `module` becomes `mutated`, `test` must fail.
+
+    It stands in that module's tests, or in the file of their folder that it names (`file.py::test`).
+    """
 
     module: str
     text: str
@@ -55,7 +58,8 @@ def killer(mutant: Mutant, cache: str) -> str | None:
 
 def test_of(mutant: Mutant) -> str:
     package, _, name = mutant.module.rpartition(".")
-    return str(Path("tests", *package.split("."), f"test_{name}.py")) + f"::{mutant.test}"
+    file, _, test = mutant.test.rpartition("::")
+    return str(Path("tests", *package.split("."), file or f"test_{name}.py")) + f"::{test}"
 
 
 def file_of(mutant: Mutant) -> Path:
@@ -71,8 +75,8 @@ def first_failure(
     """
     with tempfile.TemporaryDirectory() as directory:
         copy = Path(directory)
-        ignored = shutil.ignore_patterns("__pycache__", "weights")
-        for name in ("jaxreg", "tests"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        for name in ("jaxreg", "tests", "configs"):
             shutil.copytree(ROOT / name, copy / name, ignore=ignored)
         shutil.copy(ROOT / "pyproject.toml", copy)
         change(copy)

@@ -18,7 +18,7 @@ from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
 from jaxreg.search.learned import load_features
-from jaxreg.search.pipeline import search_described
+from jaxreg.search.stages import search_described
 from jaxreg.types import RigidTransform
 
 _SMALLEST = 512

@@ -7,7 +7,8 @@ one hypothesis from each of the clearest candidates instead of sampling, a grid 
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
 from jaxreg.search.learned import load_features
-from jaxreg.search.pipeline import Search, register_global, search_described, search_poses
+from jaxreg.search.pipeline import register_global, search_poses
+from jaxreg.search.stages import Search, search_described
 
 __all__ = [
     "Described",

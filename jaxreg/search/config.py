@@ -3,6 +3,10 @@
 import dataclasses
 import math
 
+from jaxreg.refine.config import RefineConfig
+
+_COUNTS = ("candidates", "seeds", "screened", "aligned")
+
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
@@ -28,14 +32,26 @@ class SearchConfig:
     """Distinct poses that are aligned coarsely, those of the largest overlap first."""
     aligned: int = 8
     """Distinct poses that are aligned with exact neighbours and ranked."""
+    final: RefineConfig = RefineConfig(
+        iterations=15,
+        max_correspondence_distance=0.06,
+        kernel_annealing=8.0,
+        both_directions=True,
+        k=16,
+        epsilon=0.01,
+        correspondences_per_point=2,
+        edges=True,
+    )
+    """Refinement of the best pose by `register_global`, in units of the search. Its largest distance
+    grows as the points of sparse clouds lie farther apart; a cloud of fewer points has a smaller k."""
 
     def __post_init__(self) -> None:
         """Raises ValueError where a value is out of range."""
         if not self.radii:
             raise ValueError("radii is empty: give one radius or more, in units of the search.")
-        values = {name: value for name, value in vars(self).items() if name != "radii"}
-        if self.unit is None:
-            del values["unit"]
+        values = {name: getattr(self, name) for name in _COUNTS}
+        if self.unit is not None:
+            values["unit"] = self.unit
         for name, value in [*values.items(), *(("radii", radius) for radius in self.radii)]:
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} = {value}: choose a positive, finite value.")

@@ -5,6 +5,9 @@ import pytest
 
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import compare, describe
+from jaxreg.search.pipeline import search_poses
+from jaxreg.search.stages import search_described
+from tests.search.clouds import make_pair
 
 FIELDS = ("points", "normals", "openness", "features", "mask", "spacing")
 described = jax.jit(lambda points, mask, unit: describe(points, mask, unit=unit))
@@ -74,6 +77,22 @@ def test_cosines_are_those_of_standardised_features(seed):
     local = (local - local.mean(axis=0)) / local.std(axis=0)
     local /= np.linalg.norm(local, axis=1, keepdims=True)
     np.testing.assert_allclose(found.reference.local, local[60:], atol=1e-9)
+
+
+def test_clouds_described_one_by_one_give_the_poses_of_the_search(seed):
+    """Around their own origins, in one unit; then the frame is left by hand."""
+    source, reference, _ = make_pair(seed, scale=30.0)
+    config = SearchConfig(unit=40.0, candidates=256, screened=24)
+    centres = [points.mean(axis=0) for points in (source, reference)]
+    whole = jax.jit(lambda x, y: search_poses(x, y, config=config))(source, reference)
+    once = jax.jit(lambda points, unit: describe(points, unit=unit, config=config))
+    both = (once(p - c, 40.0) for p, c in zip((source, reference), centres, strict=True))
+    found = jax.jit(lambda a, b: search_described(a, b, config=config))(*both)
+    np.testing.assert_allclose(found.score, whole.score, atol=1e-6)
+    np.testing.assert_allclose(found.poses.rotation, whole.poses.rotation, atol=1e-6)
+    rotation, translation = (np.asarray(part) for part in found.poses)
+    shift = translation * 40 + centres[1] - rotation @ centres[0]
+    np.testing.assert_allclose(shift, whole.poses.translation, atol=1e-4)
 
 
 @pytest.mark.untyped

@@ -47,7 +47,7 @@ def test_a_plane_that_faces_another_way_does_not_match():
     np.testing.assert_allclose(score_terms(pose, tilted, tilted).match, 2 * 0.64**2)
 
 
-def test_beside_the_inside_speaks_against_and_beside_a_rim_does_not():
+def test_a_gap_beside_the_interior_speaks_against_and_beside_a_boundary_does_not():
     identity = rigid.identity(jnp.float64)
     found = score_terms(identity, plane(0.0), plane(0.1, 0.1))
     np.testing.assert_allclose(found.gap, 1 + 0.6, rtol=1e-6)
@@ -68,7 +68,7 @@ def test_padding_counts_for_nothing():
     )
 
 
-def test_grids_give_about_the_evidence_and_every_other_point_is_enough(seed):
+def test_grids_give_about_the_same_terms_and_every_other_point_is_enough(seed):
     rng = np.random.default_rng(seed)
     source, reference = plane(0.0, 0.05), plane(0.0, 0.1, local=(0.8, 0.6))
     # Off the lattice, where the nearest point is one and not any of four.

@@ -56,7 +56,7 @@ def closest(moved, reference):
 
 
 def weights(distance, residual, these, scale):
-    weighting = WIDE._replace(scale=scale)
+    weighting = WIDE._replace(kernel_scale=scale)
     return robust.pair_weights(distance, residual, these.mask, weighting, 2.0)
 
 

@@ -22,6 +22,7 @@ from tests.transforms.core_rows import core_rows
 from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.refine_rows import refine_rows
 from tests.transforms.rows import Row
+from tests.transforms.search_rows import search_rows
 
 HOST = {
     "config.load_config",
@@ -31,9 +32,13 @@ HOST = {
 HOST |= {"scans.pair.register", "geometry.frame.check_clouds", "refine.config.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 HOST |= {"refine.gicp.generalized", "refine.methods.method_of"}
-HOST |= {"geometry.rigid.rotation_angle_deg", "geometry.frame.nearest_rotation"}
-HOST |= {f"geometry.frame.{name}" for name in ("common_frame", "pose_in", "pose_out")}
-"""Functions of settings, files or numpy arrays on the host: no transform applies to them."""
+HOST |= {"geometry.rigid.rotation_angle_deg", "geometry.rigid.nearest_rotation"}
+HOST |= {"geometry.frame.measure"}
+HOST |= {"search.learned.load_features", "search.learned.feature_config"}
+HOST |= {"search.learned.check_network", "search.description.check_cloud"}
+HOST |= {"search.stages.check_transform"}
+HOST |= {"search.learned.init_network"}
+"""No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
@@ -64,9 +69,21 @@ ROOMS = (
     "refine.point_to_plane",
     "refine.uncertainty",
     "refine.robust",
+    "search.alignment",
+    "search.candidates",
+    "search.compatibility",
+    "search.description",
+    "search.descriptors",
+    "search.hypotheses",
+    "search.learned",
+    "search.nearest",
+    "search.pipeline",
+    "search.ranking",
+    "search.stages",
+    "search.surface",
 )
 
-TABLE = core_rows() | network_and_model_rows() | refine_rows()
+TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows()
 
 
 def public_functions() -> set[str]:
