@@ -1,4 +1,4 @@
-"""How the constants of `jaxreg/verdict.py` were fitted, and how well they judge.
+"""How the constants of `jaxreg/scans/verdict.py` were fitted, and how well they judge.
 
     python -m research.fit_verdict [--data-root DATA] [--pairs 200]
     python -m research.fit_verdict --split test --seed 1
@@ -30,6 +30,7 @@ from jaxreg.data.seven_scenes import read_fragment
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.scans import verdict
 from jaxreg.scans.pair import register
+from research import verdict_records
 
 KINDS = ("full", "noisy", "crops", "unrelated", "apart")
 
@@ -46,6 +47,8 @@ class Options:
     seed: int = 0
     save: Path | None = None
     """Write the evidence of every pair here (JSON)."""
+    record: bool = True
+    """With `--split test`, write the tables to benchmarks/results/."""
 
 
 def sources(options: Options) -> dict:
@@ -197,6 +200,9 @@ def main(options: Options) -> None:
             weights = fit(*design(known))
             report(known, weights, f"fitted on these pairs, {name}")
             print(f"{name} = np.array([{', '.join(f'{w:.2f}' for w in weights)}])")
+    if options.record and options.split == "test":
+        for path in verdict_records.write(records):
+            print(path)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ import numpy as np
 import tyro
 from jax.lax import Precision
 
+from benchmarks import record
 from benchmarks.paper import transcription
 from benchmarks.speed import timing, workload
 from jaxreg._xla import jit
@@ -41,6 +43,8 @@ class Options:
     batch: int = 8
     rounds: int = 5
     only: tuple[str, ...] = GROUPS
+    record: bool = True
+    """Write the table to benchmarks/results/."""
 
 
 def forward(options: Options) -> dict[str, Callable]:
@@ -141,18 +145,79 @@ def show(rows: dict[str, float], unit: str) -> None:
         print(f"{name:48s} {value:9.2f} {unit}  x {value / first:.2f}", flush=True)
 
 
-def main() -> None:
-    """Print every group that is asked for."""
-    options = tyro.cli(Options, description=__doc__)
+ROWS = {
+    "batch": (
+        "a batch: pair by pair; at once, by `vmap`",
+        "forward pass, pair by pair",
+        "forward pass, the batch at once (vmap)",
+    ),
+    "neighbours": (
+        "neighbours: one selection; one sliced twice; every row sorted",
+        "neighbours, one selection",
+        "neighbours, a selection that is sliced twice",
+        "neighbours, every row sorted",
+    ),
+    "sum_and_gradient": (
+        "neighbourhood sum and its gradient: gathers in loops; indexing; matrices of 0 and 1",
+        "sum and gradient, gathers in loops",
+        "sum and gradient, indexing",
+        "sum and gradient, 0/1 matrices",
+    ),
+    "sum_alone": (
+        "the sum alone: the same three",
+        "sum, gathers in loops",
+        "sum, indexing",
+        "sum, 0/1 matrices",
+    ),
+    "compile_s": (
+        "compiling the gradient: iterations in a loop; written out",
+        "compile the gradient, iterations in a loop",
+        "compile the gradient, iterations written out",
+    ),
+    "fusion": (
+        "XLA's fusion of softmax and products: off; on",
+        "forward pass, pair by pair",
+        "forward pass, pair by pair, as jax.jit compiles it",
+    ),
+}
+"""Rows of the record: what a reader sees, what the library does, and the one or two other ways."""
+
+
+def write(taken: dict[str, float]) -> Path:
+    """The record `traps`: a row a trap, of those that were measured."""
+    rows = {}
+    for key, (label, *ways) in ROWS.items():
+        if ways[0] in taken:
+            values = [taken[way] for way in ways] + [None] * (3 - len(ways))
+            named = zip(("library", "other", "third"), values, strict=True)
+            rows[key] = {"label": label} | dict(named)
+    return record.write(
+        "traps",
+        question="What do the traps of XLA:CPU cost (milliseconds a pair; compiling in seconds)?",
+        command=record.command("benchmarks.paper.traps"),
+        columns={"library": "what the library does", "other": "otherwise", "third": "or"},
+        rows=rows,
+    )
+
+
+def main(options: Options) -> None:
+    """Print every group that is asked for, and write them."""
     jax.config.update("jax_enable_compilation_cache", False)
     print(f"{options.points} points, batch {options.batch}; milliseconds a pair, fastest run")
+    found: dict[str, float] = {}
     for name, make in (("forward", forward), ("search", search), ("sum", sums)):
         if name in options.only:
             taken = timing.alternate(make(options), rounds=options.rounds)
-            show({k: 1e3 * t.minimum / options.batch for k, t in taken.items()}, "ms")
+            milliseconds = {k: 1e3 * t.minimum / options.batch for k, t in taken.items()}
+            show(milliseconds, "ms")
+            found |= milliseconds
     if "loop" in options.only:
-        show(loop(options), "s ")
+        seconds = loop(options)
+        show(seconds, "s ")
+        found |= seconds
+    if options.record:
+        print(write(found))
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Options, description=__doc__))

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.speed import timing, workload
 from jaxreg import training
-from jaxreg.evaluation import baselines
+from jaxreg.evaluation import methods
 from jaxreg.geometry.rigid import rotation_angle_deg
 
 PEERS = (
@@ -36,12 +36,12 @@ def candidates(drawn: workload.Batch, *, transcription: bool) -> tuple[dict[str,
         found |= _networks(drawn, "transcription")
     for name in PEERS:
         try:
-            register = baselines.choose(name)
+            register = methods.choose(name).clouds
         except ValueError as error:
             missing.append(f"left out: {error}")
             continue
         found[name] = Candidate(
-            lambda i, f=register: f(drawn.sources[i], drawn.references[i]).rotation, 1
+            lambda i, f=register: f(drawn.sources[i], drawn.references[i]).transform.rotation, 1
         )
     return found, missing
 

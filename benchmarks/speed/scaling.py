@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
+from benchmarks import record
 from benchmarks.speed import processes
 
 _FROM = 1024
@@ -31,6 +32,8 @@ class Options:
     """Sizes that need more memory than this are left out."""
     picture: str = ""
     """Draw the curves to this PNG file."""
+    record: bool = True
+    """Write the table to benchmarks/results/."""
 
 
 def measure(points: int, options: Options) -> dict:
@@ -65,18 +68,54 @@ def exponent(points: list[int], values: list[float]) -> float:
     return float(np.polyfit(np.log(points), np.log(values), 1)[0])
 
 
-def summary(rows: list[dict]) -> str:
-    """The exponents of time and of the program's own memory."""
+def exponents(rows: list[dict]) -> dict[str, float]:
+    """Those of time and of the program's own memory; none where fewer than two sizes are large."""
     large = [row for row in rows if row["points"] >= _FROM]
     if len(large) < 2:
-        return f"No exponent: fewer than two sizes from {_FROM} points on."
+        return {}
     points = [row["points"] for row in large]
-    of_time, of_memory = (
-        exponent(points, [row[name] for row in large]) for name in ("seconds", "temporary_mb")
-    )
+    return {
+        f"{name}_exponent": exponent(points, [row[key] for row in large])
+        for name, key in (("time", "seconds"), ("memory", "temporary_mb"))
+    }
+
+
+def summary(rows: list[dict]) -> str:
+    """The exponents as a sentence."""
+    found = exponents(rows)
+    if not found:
+        return f"No exponent: fewer than two sizes from {_FROM} points on."
     return (
-        f"From {_FROM} points on, time grows as N^{of_time:.2f} and the memory of the program's own "
-        f"arrays as N^{of_memory:.2f}."
+        f"From {_FROM} points on, time grows as N^{found['time_exponent']:.2f} and the memory of the "
+        f"program's own arrays as N^{found['memory_exponent']:.2f}."
+    )
+
+
+def write(rows: list[dict]) -> Path:
+    """The record `scaling`: a row a size."""
+    table = {
+        f"n{row['points']}": {
+            "label": f"{row['points']} points",
+            "ms": 1e3 * row["seconds"],
+            "peak": round(row["peak_mb"]),
+            "arrays": round(row["temporary_mb"]),
+            "compile": row["trace_s"] + row["compile_s"],
+        }
+        for row in rows
+    }
+    rounded = {key: round(value, 2) for key, value in exponents(rows).items()}
+    return record.write(
+        "scaling",
+        question="How do time and memory grow?",
+        command=record.command("benchmarks.speed.scaling"),
+        columns={
+            "ms": "ms a pair",
+            "peak": "peak memory of the process, MB",
+            "arrays": "arrays, MB",
+            "compile": "compile, s",
+        },
+        rows=table,
+        setting=rounded | {"from_points": _FROM},
     )
 
 
@@ -106,7 +145,7 @@ def draw(rows: list[dict], path: str) -> None:
 
 
 def main() -> None:
-    """Measure every size, print the table as it grows, draw the picture if asked."""
+    """Measure every size, print the table as it grows, write it, draw the picture if asked."""
     options = tyro.cli(Options, description=__doc__)
     print("| points | ms a pair | peak memory, MB | arrays of the program, MB | compile, s |")
     print("|---|---|---|---|---|")
@@ -119,6 +158,8 @@ def main() -> None:
     print(summary(rows))
     if options.picture and rows:
         draw(rows, options.picture)
+    if options.record:
+        print(write(rows))
 
 
 if __name__ == "__main__":

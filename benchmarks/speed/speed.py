@@ -18,20 +18,17 @@ ModelNet40 protocol: three quarters kept, up to 45 degrees an axis.
 """
 
 import dataclasses
-import json
 import os
-import platform
 import sys
-from pathlib import Path
 from typing import Literal
 
-import jax
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import record
 from benchmarks.paper import accuracy
-from benchmarks.speed import candidates, processes, stages
+from benchmarks.speed import candidates, processes, records, stages
 from jaxreg.cli.process import restart_with_huge_pages
 
 Part = Literal["forward", "training", "stages", "programs", "first", "accuracy"]
@@ -59,8 +56,9 @@ class Options:
     """Run on so many cores; 0 is all."""
     huge_pages: bool = False
     """Run in memory pages of 2 MB, as train.py does on Linux."""
-    json: str = ""
-    """Write the figures to this file."""
+    record: bool = True
+    """Write the tables to benchmarks/results/: `speed` and `sizes` (with --cores 1 `speed_one_core`),
+    `stages`, `processes` and `accuracy`."""
 
 
 def show_registration(points: int, options: Options) -> list[dict]:
@@ -126,7 +124,7 @@ def simple_table(title: str, rows: list[dict]) -> Table:
 
 
 def show_stages(options: Options) -> list[dict]:
-    """The table of stages; returns its rows."""
+    """The table of stages; returns its rows, the last of the whole, with their share of the rate."""
     points, batch = options.points[0], options.batch
     rows, whole, rate = stages.measure(points, batch, rounds=options.rounds)
     together = sum(row["seconds"] for row in rows)
@@ -146,7 +144,7 @@ def show_stages(options: Options) -> list[dict]:
         f"matrix product {rate / 1e9:.0f} GFLOP/s"
     )
     CONSOLE.print(simple_table(title, shown))
-    return [*rows, whole]
+    return [row | {"rate": rate} for row in (*rows, whole)]
 
 
 def first_results(options: Options) -> list[dict]:
@@ -235,25 +233,23 @@ def confine(cores: int) -> None:
         os.execv(sys.executable, sys.orig_argv)
 
 
-def machine() -> dict:
-    """Where the figures come from."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    processor = names[0] if names else platform.processor()
-    return {"processor": processor, "cores used": cores, "jax": jax.__version__}
-
-
 def main() -> None:
-    """Measure the parts that are asked for, and print their tables."""
+    """Measure the parts that are asked for, print their tables, write them."""
     options = tyro.cli(Options, description=__doc__)
     if options.huge_pages:
         restart_with_huge_pages()
     if options.cores:
         confine(options.cores)
-    results = {"options": dataclasses.asdict(options), "machine": machine()}
-    CONSOLE.print(simple_table("machine", [results["machine"]]))
+    CONSOLE.print(f"{record.machine()}, seconds of the fastest run")
+    results = measure(options)
+    if options.record:
+        for path in records.write(results, options):
+            CONSOLE.print(str(path))
+
+
+def measure(options: Options) -> dict[str, list]:
+    """The rows of every part, which are printed on the way."""
+    results: dict[str, list] = {}
     if "forward" in options.parts:
         results["forward"] = [show_registration(n, options) for n in options.points]
     if "training" in options.parts:
@@ -269,8 +265,7 @@ def main() -> None:
             CONSOLE.print(simple_table(f"{title}, {options.points[0]} points", rows))
     if "accuracy" in options.parts:
         results["accuracy"] = show_accuracy(options)
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    return results
 
 
 if __name__ == "__main__":
