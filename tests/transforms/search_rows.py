@@ -227,11 +227,17 @@ def whole() -> dict[str, Row]:
         "pipeline.enter": Row(
             entered, (x, y, ALL), tuple((c, c, ALL) for c in clouds_that_break().values())
         ),
-        "stages.search_described": Row(searched, (x, y, ALL, bound), broken, smooth=False),
+        "stages.search_described": Row(
+            searched, (x, y, ALL, bound), broken, smooth=False, rounding=1e-7
+        ),
         "pipeline.search_poses": Row(
-            poses_of(pipeline.search_poses), (x, y, ALL, bound), broken, smooth=False
+            poses_of(pipeline.search_poses), (x, y, ALL, bound), broken, smooth=False, rounding=1e-7
         ),
         "pipeline.register_global": Row(
-            poses_of(pipeline.register_global), (x, y, ALL, bound), broken, smooth=False
+            poses_of(pipeline.register_global),
+            (x, y, ALL, bound),
+            broken,
+            smooth=False,
+            rounding=1e-7,
         ),
     }
