@@ -33,7 +33,8 @@ def check_points(
             f"{name} has shape {array.shape}, not (n, 3): give one point a row, x y z, "
             "as in points[:, :3]."
         )
-    finite = np.asarray(np.isfinite(array).all(axis=1))
+    x, y, z = np.isfinite(array).T  # three columns at a time are quicker than rows of three
+    finite = x & y & z
     if nonfinite == "raise" and not finite.all():
         row = int(np.argmin(finite))
         raise ValueError(
@@ -44,10 +45,8 @@ def check_points(
         raise ValueError(
             f"{name} has {finite.sum()} finite points: a pose needs at least {_FEWEST}."
         )
-    largest = np.abs(np.where(finite[:, None], array, 0)).max(axis=1)
-    huge = np.asarray(finite & (largest > _LARGEST))
-    if huge.any():
-        row = int(np.argmax(huge))
+    if np.abs(array).max(initial=0, where=finite[:, None]) > _LARGEST:
+        row = int(np.argmax(finite & (np.abs(array) > _LARGEST).any(axis=1)))
         raise ValueError(
             f"{name}: point {row} is {array[row].tolist()}, beyond {_LARGEST:g}: use a larger unit."
         )
