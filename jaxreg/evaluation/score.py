@@ -256,5 +256,7 @@ def draw_first_pair(path: str | Path, scored: Scored) -> None:
 
     source, reference, truth = scored.first
     transform = jax.tree.map(lambda x: np.asarray(x)[0], scored.predicted)
-    clouds = (np.asarray(cloud.points)[np.asarray(cloud.mask)] for cloud in (source, reference))
-    plot_pair(*clouds, transform=transform, path=path, truth=truth)
+    moving, fixed = (
+        np.asarray(cloud.points)[np.asarray(cloud.mask)] for cloud in (source, reference)
+    )
+    plot_pair(moving, fixed, transform, path, truth=truth)

@@ -41,7 +41,7 @@ def probe(pose):
     return jnp.sum(pose.rotation * weights) + jnp.sum(pose.translation * weights[0])
 
 
-SOLVED = RefineConfig(iterations=40, kernel_annealing=1.0, tolerance=1e-9)
+SOLVED = RefineConfig(iterations=120, kernel_annealing=1.0, tolerance=1e-9)
 """Enough iterations at one width of the kernel to stand at the fixed point in float64."""
 
 
@@ -58,9 +58,12 @@ def gradients(source, reference, config):
 @pytest.mark.parametrize("kernel", ["none", "geman_mcclure"])
 @pytest.mark.parametrize("number", range(3))
 def test_implicit_gradient_is_that_of_the_solution(method, kernel, number, seed):
-    clouds = make_pair(seed + number)
     config = dataclasses.replace(SOLVED, method=method, kernel=kernel)
-    (value, result), unrolled = gradients(*clouds, config)
+    for scene in range(number, 60, 10):  # some alternate between two sets of pairs for ever
+        clouds = make_pair(seed + scene)
+        (value, result), unrolled = gradients(*clouds, config)
+        if result.converged:
+            break
     (same_value, same), implicit = gradients(
         *clouds, dataclasses.replace(config, gradient="implicit")
     )
