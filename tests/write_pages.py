@@ -5,8 +5,10 @@
 Run it twice: the second time nothing is compiled, and the seconds are those of a usual run.
 """
 
+import base64
 import contextlib
 import json
+import re
 import sys
 import tempfile
 import types
@@ -33,16 +35,29 @@ def write_page(path: Path) -> None:
 
 
 def write_notebook(path: Path) -> None:
-    """The same for the cells of a notebook; pictures are not stored."""
+    """The same for the cells of a notebook, and the pictures that they show."""
     notebook, names = json.loads(path.read_text(encoding="utf-8")), {}
     display = types.SimpleNamespace(Image=lambda path, width: None)
-    sys.modules["IPython.display"] = display  # Not needed to run a notebook without pictures.
+    sys.modules["IPython.display"] = display  # Nothing else of IPython is needed here.
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code":
-            printed = run_python("".join(cell["source"]), names).splitlines(keepends=True)
+            source = "".join(cell["source"])
+            printed = run_python(source, names).splitlines(keepends=True)
             stream = {"name": "stdout", "output_type": "stream", "text": printed}
             cell["outputs"] = [stream] if printed else []
+            if shown := re.search(r'^Image\("(.+)", width=(\d+)\)', source, re.MULTILINE):
+                cell["outputs"].append(picture(Path(shown[1]), int(shown[2])))
     path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def picture(path: Path, width: int) -> dict:
+    """A PNG file as the output of a cell."""
+    data = {"image/png": base64.b64encode(path.read_bytes()).decode()}
+    return {
+        "data": data,
+        "metadata": {"image/png": {"width": width}},
+        "output_type": "display_data",
+    }
 
 
 def main(chosen: list[str]) -> None:
