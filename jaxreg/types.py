@@ -5,7 +5,7 @@ A transform maps *source* to *reference*: ``y = R x + t`` for a column vector ``
 degrees. Lengths have the unit of the input.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
 
@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 class RigidTransform(NamedTuple):
     """A rotation and a translation that map source to reference, ``y = R x + t``.
 
-    With leading axes there are many, one for every index of them.
+    JAX or numpy arrays. With leading axes there are many, one for every index of them.
     """
 
-    rotation: Float[Array, "*b 3 3"]
-    translation: Float[Array, "*b 3"]
+    rotation: Float[Any, "*b 3 3"]
+    translation: Float[Any, "*b 3"]
 
 
 class PointCloud(NamedTuple):

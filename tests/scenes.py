@@ -1,8 +1,14 @@
-"""Clouds and poses that the tests of degenerate cases share, and what a proper rotation is."""
+"""Clouds, poses and networks that the tests of several rooms share, and what a proper rotation is."""
 
+import functools
+
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+from jaxreg.config import ModelConfig
+from jaxreg.network.model import init_variables
 
 
 def shape(rng, n=300) -> np.ndarray:
@@ -47,3 +53,20 @@ def assert_proper(rotation, tolerance=1e-9):
     assert np.isfinite(rotation).all()
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=tolerance)
     assert np.linalg.det(rotation) == pytest.approx(1, abs=tolerance)
+
+
+def draw_pair(rng, n, m):
+    """Two clouds that share most points, the second moved by a small random pose."""
+    points = rng.uniform(-1, 1, (max(n, m), 3))
+    turn = Rotation.from_euler("zyx", rng.uniform(0, 0.5, 3)).as_matrix()
+    return points[:n], points[:m] @ turn.T + rng.uniform(-0.3, 0.3, 3)
+
+
+@functools.cache
+def variables_of(config: ModelConfig):
+    """Parameters and statistics of a network, away from their initial zeros and ones."""
+    rng = np.random.default_rng(0)  # Of some other seeds no unit is alive, and no pose defined.
+    shapes = jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
+    variables = jax.tree.map(lambda x: rng.normal(0, 0.4, x.shape), shapes)
+    positive = jax.tree.map(lambda x: 0.5 + np.abs(x), variables["batch_stats"])
+    return {"params": variables["params"], "batch_stats": positive}

@@ -141,6 +141,7 @@ def _as_trained(options: Options, path: Path, given: Collection[str], method: st
     if not options.checkpoint:
         return config
     trained, changed = methods.trained_config(method), {}
+    assert trained is not None  # a checkpoint is always a network
     for name in ("iterations", "n_inliers"):
         value, wanted = getattr(trained.model, name), getattr(config.model, name)
         if f"model.{name}" not in given and value != wanted:

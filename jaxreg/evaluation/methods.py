@@ -172,16 +172,25 @@ def identity_method(pair: Pair) -> RigidTransform:
 
 
 def _plain_icp(source: PointCloud, reference: PointCloud) -> RigidTransform:
-    masks = {"source_mask": source.mask, "reference_mask": reference.mask}
     config = RefineConfig("icp", iterations=50, kernel="none")
-    return icp(source.points, reference.points, config=config, **masks).transform
+    return icp(
+        source.points,
+        reference.points,
+        source_mask=source.mask,
+        reference_mask=reference.mask,
+        config=config,
+    ).transform
 
 
 def _global(network: Network | None) -> Callable[[PointCloud, PointCloud], RigidTransform]:
     def one(source: PointCloud, reference: PointCloud) -> RigidTransform:
-        masks = {"source_mask": source.mask, "reference_mask": reference.mask}
-        found = register_global(source.points, reference.points, network=network, **masks)
-        return found.transform
+        return register_global(
+            source.points,
+            reference.points,
+            source_mask=source.mask,
+            reference_mask=reference.mask,
+            network=network,
+        ).transform
 
     return one
 

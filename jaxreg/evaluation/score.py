@@ -107,6 +107,7 @@ def evaluate(
     if improve is not None:
         function = improve if function is None else methods.refined_method(function, improve)
     if function is None:
+        assert given is not None  # one of the two was asked for
         predicted, truth, seconds = given, true_transforms(batches), None
     else:
         with counting_progress(count, label) as progress:
@@ -246,7 +247,7 @@ def save_transforms(path: str | Path, transforms: RigidTransform) -> None:
 def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
     # Opened here: to a name without .npz numpy would add it.
     with Path(path).open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def draw_first_pair(path: str | Path, scored: Scored) -> None:
@@ -255,6 +256,5 @@ def draw_first_pair(path: str | Path, scored: Scored) -> None:
 
     source, reference, truth = scored.first
     transform = jax.tree.map(lambda x: np.asarray(x)[0], scored.predicted)
-    plot_pair(
-        source.points[source.mask], reference.points[reference.mask], transform, path, truth=truth
-    )
+    clouds = (np.asarray(cloud.points)[np.asarray(cloud.mask)] for cloud in (source, reference))
+    plot_pair(*clouds, transform=transform, path=path, truth=truth)

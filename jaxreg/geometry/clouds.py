@@ -33,7 +33,7 @@ def check_points(
             f"{name} has shape {array.shape}, not (n, 3): give one point a row, x y z, "
             "as in points[:, :3]."
         )
-    finite = np.isfinite(array).all(axis=1)
+    finite = np.asarray(np.isfinite(array).all(axis=1))
     if nonfinite == "raise" and not finite.all():
         row = int(np.argmin(finite))
         raise ValueError(
@@ -44,7 +44,8 @@ def check_points(
         raise ValueError(
             f"{name} has {finite.sum()} finite points: a pose needs at least {_FEWEST}."
         )
-    huge = finite & (np.abs(np.where(finite[:, None], array, 0)) > _LARGEST).any(axis=1)
+    largest = np.abs(np.where(finite[:, None], array, 0)).max(axis=1)
+    huge = np.asarray(finite & (largest > _LARGEST))
     if huge.any():
         row = int(np.argmax(huge))
         raise ValueError(

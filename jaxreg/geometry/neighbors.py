@@ -8,18 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._xla import at_row_min, row_min
+from jaxreg._xla import row_min
 
 _BLOCK = 2048
 """Points whose distances to all others are held at once."""
+_ROUNDINGS = 4
+"""Of the largest coordinate, in units of its last digit: by how much two distances may differ and count
+as equal."""
 
 
 def squared_distances(
     points: Float[Array, "n 3"], others: Float[Array, "m 3"]
 ) -> Float[Array, "n m"]:
     """``d[i, j] = |points[i] - others[j]|^2``."""
-    differences = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
-    return sum(d * d for d in differences)
+    x, y, z = (points[:, None, axis] - others[None, :, axis] for axis in range(3))
+    return x * x + y * y + z * z
 
 
 def without_padding(
@@ -92,13 +95,19 @@ def nearest_in(
 
     Of those that are equally near, up to rounding, it is the first.
     """
-    distance = jax.lax.stop_gradient(squared_distances(points, without_padding(others, mask)))
+    points, others = jax.lax.stop_gradient((points, without_padding(others, mask)))
+    distance = squared_distances(points, others)
     if mask is not None:
         distance = jnp.where(mask[None, :], distance, jnp.inf)
+    # XLA may compute coordinates and distances anew for the comparison, to other last digits, and of
+    # points that coincide but for these no distance would equal the smallest.
+    largest = jnp.max(jnp.abs(points), axis=1) + jnp.max(jnp.abs(others))
+    rounding = _ROUNDINGS * jnp.finfo(points.dtype).eps * largest
+    near = distance <= ((jnp.sqrt(row_min(distance)) + rounding) ** 2)[:, None]
     # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
     # argmin, which carries both through one reduction, element by element.
     column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
-    return row_min(jnp.where(at_row_min(distance), column, others.shape[0] - 1))
+    return row_min(jnp.where(near, column, others.shape[0] - 1))
 
 
 def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:

@@ -114,7 +114,7 @@ def to_jaxlie(transform: RigidTransform) -> Any:
       ValueError: it is not a transform.
     """
     try:
-        import jaxlie
+        import jaxlie  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ImportError("to_jaxlie needs jaxlie: pip install jaxlie.") from None
     _leading_axes(transform)

@@ -5,6 +5,8 @@ known, and is no part of the method. Sums run over points as in the paper; means
 caller's, so that the mix of the terms does not depend on the batch.
 """
 
+import functools
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -146,4 +148,5 @@ def step_losses(
 def total_loss(terms: LossTerms, config: LossConfig) -> Float[Array, ""]:
     """``L = sum over steps of L_gc + gamma L_in + rho L_gs + lambda L_sc`` (Eq. 18)."""
     weights = (config.global_consistency, config.gamma, config.rho, config.lambda_)
-    return sum(w * jnp.sum(term) for w, term in zip(weights, terms, strict=True))
+    weighted = (w * jnp.sum(term) for w, term in zip(weights, terms, strict=True))
+    return functools.reduce(operator.add, weighted)

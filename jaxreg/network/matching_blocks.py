@@ -4,6 +4,8 @@
 Here the distances are computed again instead of kept: at 16,384 x 16,384 points one array is 1 GB.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -56,11 +58,13 @@ def match_in_blocks(
     branches = tuple(_padded(branch, -n % BLOCK) for branch in branches)
     # The sum is linear: branches on the same graphs need one sum.
     groups = [branches] if shared else [(branch,) for branch in branches]
-    dual = sum(_neighborhood_sum(group, valid) for group in groups)
+    dual = functools.reduce(operator.add, (_neighborhood_sum(group, valid) for group in groups))
 
     def last(dual, *sources):
         pairs = zip(sources, branches, strict=True)
-        distance = sum(feature_distance(x, b.reference) for x, b in pairs)
+        distance = functools.reduce(
+            operator.add, (feature_distance(x, b.reference) for x, b in pairs)
+        )
         dual = dual / k if valid is None else jnp.where(valid[None, :], dual / k, 0)
         scores = matching_scores(final_distance(distance, dual, alpha=alpha), valid)
         return match(dual, scores, reference)
@@ -74,7 +78,10 @@ def _neighborhood_sum(branches: tuple[Branch, ...], valid) -> Float[Array, "n m"
 
     def over_columns(*sources):
         pairs = zip(sources, branches, strict=True)
-        scores = sum(matching_scores(feature_distance(x, b.reference), valid) for x, b in pairs)
+        scores = functools.reduce(
+            operator.add,
+            (matching_scores(feature_distance(x, b.reference), valid) for x, b in pairs),
+        )
         return _row_sum(scores.T, branches[0].reference_graph).T
 
     summed = _by_rows(over_columns, *(branch.source for branch in branches))

@@ -118,7 +118,7 @@ def _structure(points, neighbors, config: ModelConfig):
     return geometric_structure(points, neighbors, edge=config.edge, angles=config.angles)
 
 
-def _run(module, name: str, variables: Variables, *inputs, train: bool):
+def _run(module, name: str, variables: Variables, *inputs, train: bool) -> tuple[Any, Variables]:
     """Apply a network; returns its output and `variables` with the statistics it updated."""
     own = {kind: tree[name] for kind, tree in variables.items()}
     if not train:

@@ -1,6 +1,6 @@
 """Which point of the source belongs to which point of the reference, and how much a pair counts."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -14,9 +14,9 @@ class Pairs(NamedTuple):
     Pairs with `mask` False join anything and count for nothing.
     """
 
-    source_index: Int[Array, "p"]
-    reference_index: Int[Array, "p"]
-    mask: Bool[Array, "p"]
+    source_index: Int[Any, "p"]
+    reference_index: Int[Any, "p"]
+    mask: Bool[Any, "p"]
 
 
 def closest_pairs(

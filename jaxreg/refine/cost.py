@@ -1,7 +1,7 @@
 """What pairs under a pose cost: the part in which the methods of the ICP family differ."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -21,8 +21,8 @@ class Scene(NamedTuple):
 
     source: Float[Array, "n 3"]
     reference: Float[Array, "m 3"]
-    source_surface: Float[Array, "n *s"] | None
-    reference_surface: Float[Array, "m *s"] | None
+    source_surface: Any
+    reference_surface: Any
     weighting: Weighting
 
 

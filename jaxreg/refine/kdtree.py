@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry.clouds import padded_size
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
@@ -109,6 +109,7 @@ def iterate(
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + config.iterations) // 2, config.iterations - 1)
             i = max(i + 1, halfway) if still else i + 1
+    assert pairs is not None  # there is one iteration at least
     return pose, taken, converged, pairs
 
 
@@ -153,8 +154,8 @@ def _step(pose, source, reference, pairs, kernel_scale, distance, width, *, conf
     (x, *source_shape, source_scale), (y, *reference_shape, reference_scale) = source, reference
     weighting = Weighting(config.kernel, kernel_scale, distance, config.trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
-    surfaces = (_surface(shape, config) for shape in (source_shape, reference_shape))
-    scene = Scene(x * source_scale, y * reference_scale, *surfaces, weighting)
+    here, there = (_surface(shape, config) for shape in (source_shape, reference_shape))
+    scene = Scene(x * source_scale, y * reference_scale, here, there, weighting)
     method = method_of(config)
     return method.step(pose, match(scene, pose, pairs, method, width))
 

@@ -84,7 +84,7 @@ def _iterate(
         return new, change_of_pose(pose, new)
 
     dtype = problem.scene.source.dtype
-    widths = widenings(config.iterations, config.kernel_annealing, dtype)
+    widths = jnp.asarray(widenings(config.iterations, config.kernel_annealing, dtype))
     pose, changes = jax.lax.scan(step, problem.start, widths)
     return pose, changes[-1]
 

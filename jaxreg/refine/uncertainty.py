@@ -4,7 +4,7 @@ Both come from the distances to the planes of the reference, whatever method fou
 that slide along a surface are the same surface to any scanner.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,12 +43,12 @@ class PoseUncertainty(NamedTuple):
     the radius that makes rotations and translations comparable, `weight` is ``sum_i w_i``.
     """
 
-    information: Float[Array, "6 6"]
-    covariance: Float[Array, "6 6"]
-    variance: Float[Array, ""]
-    weight: Float[Array, ""]
-    centre: Float[Array, "3"]
-    length: Float[Array, ""]
+    information: Float[Any, "6 6"]
+    covariance: Float[Any, "6 6"]
+    variance: Float[Any, ""]
+    weight: Float[Any, ""]
+    centre: Float[Any, "3"]
+    length: Float[Any, ""]
 
 
 class WeakDirection(NamedTuple):

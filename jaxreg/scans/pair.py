@@ -140,18 +140,19 @@ def register(
     config = RegisterConfig() if config is None else config
     _check_options(max_rotation_deg, config)
     start = None if initial is None else check_pose(initial, "initial")
-    clouds = (
-        _prepared(cloud, name, nonfinite, config)
-        for cloud, name in ((source, "source"), (reference, "reference"))
+    problem = _pose_problem(
+        _prepared(source, "source", nonfinite, config),
+        _prepared(reference, "reference", nonfinite, config),
+        config,
     )
-    problem = _pose_problem(*clouds, config)
     if start is None:
         found = _search(problem, max_rotation_deg)
     else:
         found = _Found(frame.transform_in(problem.where, start), verdict.NOT_SEARCHED, ())
     refined = _refine(problem, found.pose)
+    placed = problem.placed()
     judged = verdict.evidence(
-        refined.transform, *problem.placed(), problem.distance, rival=found.rival
+        refined.transform, placed[0], placed[1], problem.distance, rival=found.rival
     )
     return _result(problem, refined, judged, found.alternatives)
 

@@ -14,7 +14,7 @@ from typing import Literal
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
@@ -163,10 +163,11 @@ def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]
     clouds = (source, reference)
     spacings = [cloud.coarse.spacing * cloud.radius for cloud in clouds]
     size = in_steps(max(spacings))
-    return tuple(
+    one, other = (
         cloud.thinned(size) if _UNALIKE * spacing < max(spacings) else cloud.coarse
         for cloud, spacing in zip(clouds, spacings, strict=True)
     )
+    return one, other
 
 
 def in_steps(value: float) -> float:
@@ -229,8 +230,8 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
     k = min(4, len(points) - 1)
     if k < 1:
         return 0.0
-    tree = cKDTree(points) if tree is None else tree
-    return float(np.median(tree.query(points, k=k + 1, workers=-1)[0][:, -1]))
+    found = cKDTree(points) if tree is None else tree
+    return float(np.median(found.query(points, k=k + 1, workers=-1)[0][:, -1]))
 
 
 @functools.partial(jax.jit, static_argnames="config")

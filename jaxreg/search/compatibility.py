@@ -71,7 +71,7 @@ def _invariants(points: Array, normals: Array, tolerance: float) -> tuple[Array,
     line = [points[None, :, axis] - points[:, None, axis] for axis in range(3)]
     n_i, n_k = list(normals.T[:, :, None]), list(normals.T[:, None, :])
     dot = lambda a, b: jnp.abs(sum(x * y for x, y in zip(a, b, strict=True)))  # noqa: E731
-    length = safe_sqrt(sum(x * x for x in line))
+    length = safe_sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)
     # The direction of a short line is noise, so its slope is drawn towards zero.
     shorter = 1 / (length + tolerance / 2)
     return length, dot(n_i, n_k), dot(n_i, line) * shorter, dot(n_k, line) * shorter

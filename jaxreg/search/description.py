@@ -115,7 +115,7 @@ def compare(source: Described, reference: Described, *, network: Network | None 
     local = standardized(
         source.features[:, :INVARIANTS], reference.features[:, :INVARIANTS], *masks
     )
-    surfaces = [
+    here, there = surfaces = [
         Surface(cloud.points, cloud.normals, cloud.openness, nearby, cloud.mask)
         for cloud, nearby in zip((source, reference), local, strict=True)
     ]
@@ -126,7 +126,7 @@ def compare(source: Described, reference: Described, *, network: Network | None 
             learned_features(network, moments, s.openness, s.points, s.normals, s.mask)
             for moments, s in zip((one, other), surfaces, strict=True)
         )
-    return Compared(*surfaces, jnp.matmul(one, other.T, precision=Precision.HIGHEST))
+    return Compared(here, there, jnp.matmul(one, other.T, precision=Precision.HIGHEST))
 
 
 def check_cloud(name: str, points: Array, mask: Array | None) -> None:

@@ -32,7 +32,9 @@ def gaussian_normals(
 
     The direction of the smallest variance of the points around each, weighted by
     ``exp(-|p_j - p|^2 / (2 (radius/2)^2))``; `squared` are the squared distances within the cloud.
+    Constants of every derivative, as the moments are.
     """
+    points, squared = jax.lax.stop_gradient((points, squared))
     table = jnp.concatenate([points, _outer(points)], axis=1)
     means = _means(squared, table, mask, radius)
     spread = means[:, 3:].reshape(-1, 3, 3) - means[:, :3, None] * means[:, None, :3]
@@ -56,8 +58,10 @@ def moments(
     to the point's own normal n: ``|o . n| / r``, ``|o - n (o . n)| / r``, ``sqrt(n^T C n) / r``,
     ``sqrt(n^T N n)`` (normals have no sign, so each enters squared).
 
-    The points should lie around the origin, since C is a difference of means of squares.
+    The points should lie around the origin, since C is a difference of means of squares. A constant
+    of every derivative: which points match is a discrete choice.
     """
+    points, normals, squared = jax.lax.stop_gradient((points, normals, squared))
     table = jnp.concatenate([points, _outer(points), _outer(normals)], axis=1)
     # One scale after the other: a third quicker than all at once, whose weights (n, n) leave the cache.
     blocks = jax.lax.map(

@@ -5,6 +5,7 @@ cosines. Trained on pairs of procedural shapes by `python -m research.train_feat
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from jaxreg.search.config import FeatureConfig, SearchConfig
 from jaxreg.search.descriptors import INVARIANTS, NORMAL_RADIUS, OPENNESS_RADIUS
 from jaxreg.weights.released import load_arrays
 
-Network = dict[str, Float[Array, "..."] | Float[np.ndarray, "..."]]
+Network = Mapping[str, Float[Array, "..."] | Float[np.ndarray, "..."]]
 """A matrix for every layer, and its bias under the same name with "_bias"."""
 
 _DEFAULT = SearchConfig()

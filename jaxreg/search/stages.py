@@ -115,7 +115,7 @@ def _check_search(source: Described, reference: Described, similarity, also, max
         )
     if also is not None:
         check_transform(also)
-    if not isinstance(max_angle, jax.core.Tracer) and not 0 < max_angle <= math.pi + 1e-6:
+    if not isinstance(max_angle, jax.Array) and not 0 < max_angle <= math.pi + 1e-6:
         raise ValueError(
             f"max_angle = {max_angle}: give an angle in (0, pi], in radians (np.radians(degrees))."
         )

@@ -6,14 +6,14 @@ import functools
 import jax
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from benchmarks.paper import transcription
 from jaxreg.config import Config, ModelConfig
-from jaxreg.network.model import init_variables, register_pair
+from jaxreg.network.model import register_pair
 from jaxreg.training import batch_loss
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from jaxreg.weights.released import load_pretrained
+from tests.scenes import draw_pair, variables_of
 
 # Flax promotes float64 with the float32 that it starts from.
 pytestmark = pytest.mark.loose
@@ -33,22 +33,6 @@ SMALL = ModelConfig(
 @pytest.fixture
 def rng(seed):
     return np.random.default_rng(seed)
-
-
-def draw_pair(rng, n, m):
-    """Clouds that share most points; none of the two is a copy of the other."""
-    points = rng.uniform(-1, 1, (max(n, m), 3))
-    turn = Rotation.from_euler("zyx", rng.uniform(0, 0.5, 3)).as_matrix()
-    return points[:n], points[:m] @ turn.T + rng.uniform(-0.3, 0.3, 3)
-
-
-def variables_of(config):
-    """Parameters and statistics away from their initial zeros and ones."""
-    rng = np.random.default_rng(0)  # Of some other seeds no unit is alive, and no pose defined.
-    shapes = jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
-    variables = jax.tree.map(lambda x: rng.normal(0, 0.4, x.shape), shapes)
-    positive = jax.tree.map(lambda x: 0.5 + np.abs(x), variables["batch_stats"])
-    return {"params": variables["params"], "batch_stats": positive}
 
 
 @functools.cache

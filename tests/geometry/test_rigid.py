@@ -192,3 +192,12 @@ def test_a_missing_jaxlie_is_named(monkeypatch, rng):
     monkeypatch.setitem(sys.modules, "jaxlie", None)
     with pytest.raises(ImportError, match="to_jaxlie needs jaxlie: pip install jaxlie"):
         rigid.to_jaxlie(draw(rng))
+
+
+def test_angle_between_rotations_is_scipy_s(seed):
+    one, other = (Rotation.random(20, random_state=seed + i) for i in range(2))
+    expected = np.degrees((one * other.inv()).magnitude())
+    angle = rigid.rotation_angle_deg(one.as_matrix(), other.as_matrix())
+    np.testing.assert_allclose(angle, expected, rtol=1e-10)
+    tiny = Rotation.from_rotvec([[1e-9, 0, 0]]).as_matrix()
+    np.testing.assert_allclose(rigid.rotation_angle_deg(tiny, np.eye(3)[None]), np.degrees(1e-9))

@@ -10,7 +10,8 @@ from jaxreg.network import matching_blocks
 from jaxreg.network.matching import feature_distance, incidence, match, matching_maps
 from jaxreg.network.matching_blocks import Branch, match_in_blocks
 from jaxreg.network.model import register_pair
-from tests.network.test_model import small, variables_of
+from tests.network.test_model import small
+from tests.scenes import variables_of
 
 N, M, C, K, ALPHA = 20, 24, 6, 3, 0.7
 

@@ -11,6 +11,7 @@ from jaxreg.geometry import rigid
 from jaxreg.refine.gauss_newton import (
     gauss_newton_step,
     normal_equations,
+    perturbation,
     rotation_from_vector,
     skew,
     solve_damped,
@@ -91,6 +92,20 @@ def test_small_motion_is_found_in_one_step(seed):
     found = gauss_newton_step(rigid.identity(p.dtype), p, rigid.apply(motion, p), metric)
     np.testing.assert_allclose(found.rotation, motion.rotation, atol=1e-7)
     np.testing.assert_allclose(found.translation, motion.translation, atol=1e-7)
+
+
+def test_perturbation_is_zero_with_the_derivative_of_the_motion(seed):
+    rng = np.random.default_rng(seed)
+    pose = RigidTransform(
+        jnp.asarray(Rotation.random(random_state=rng).as_matrix()), 3 * jnp.ones(3)
+    )
+
+    def of_motion(motion):
+        return perturbation(update_left(pose, *jnp.split(motion, 2)))
+
+    np.testing.assert_allclose(of_motion(jnp.asarray(rng.normal(size=6))), 0, atol=1e-15)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(of_motion)(jnp.zeros(6)), np.eye(6), atol=1e-12)
 
 
 def test_step_is_bounded_and_differentiable(seed):

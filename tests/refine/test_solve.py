@@ -307,3 +307,15 @@ def test_keywords_win_over_the_configuration_and_may_be_traced(method, seed):
     slope = jax.grad(residual)(jnp.asarray(0.02))
     difference = (residual(jnp.asarray(0.02 + 1e-6)) - residual(jnp.asarray(0.02 - 1e-6))) / 2e-6
     np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
+
+
+@each_method
+def test_copies_correspond_in_batches_too(method, seed):
+    """XLA computes the moved points of a batch anew where their distances are compared."""
+    x = np.random.default_rng(seed).normal(size=(3, 30, 3))
+    turn = Rotation.from_rotvec([0.02, 0.05, 0.03]).as_matrix()
+    y = jnp.asarray(x @ turn.T + 0.02)
+    config = RefineConfig(method, iterations=8)
+    result = jax.jit(jax.vmap(partial(eager_refine, config=config)))(jnp.asarray(x), y)
+    np.testing.assert_allclose(result.correspondences, y, atol=1e-12)
+    np.testing.assert_allclose(result.confidence, 1, atol=1e-12)

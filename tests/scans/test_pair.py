@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural import shapes
+from jaxreg.refine import kdtree
 from jaxreg.refine.config import RefineConfig
-from jaxreg.scans import verdict
+from jaxreg.scans import prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
@@ -417,3 +418,63 @@ def test_units_that_differ_beyond_single_precision(pair):
         assert np.isfinite(result.transformation).all()
         assert not result.success
         assert np.isfinite(register(pair[0], scale * pair[1]).transformation).all()
+
+
+def counted(monkeypatch, module, name, calls):
+    original = getattr(module, name)
+
+    def counting(*arguments, **keywords):
+        calls.append(name)
+        return original(*arguments, **keywords)
+
+    monkeypatch.setattr(module, name, counting)
+
+
+def test_a_prepared_cloud_is_not_worked_on_again(pair, result, monkeypatch):
+    """Neither checked, ordered, thinned, indexed nor described, whoever it meets."""
+    source, reference = (prepare.prepare(points) for points in pair[:2])
+    third = prepare.prepare(pair[1] @ np.diag([1.0, -1, -1]) + 5)
+    found = register(source, reference)
+    np.testing.assert_array_equal(found.transformation, result.transformation)
+    register(source, third)
+    register(third, source)  # the tree of all points is that of a reference
+    calls = []
+    for module, names in (
+        (prepare, ("check_points", "_distinct", "reduce_to", "cKDTree", "_describe")),
+        (kdtree, ("cKDTree", "_described")),
+    ):
+        for name in names:
+            counted(monkeypatch, module, name, calls)
+    again = register(source, reference)
+    register(reference, third)
+    register(third, source, initial=np.eye(4), max_rotation_deg=30)
+    assert calls == []
+    np.testing.assert_array_equal(again.transformation, result.transformation)
+    prepare.prepare(pair[0]).fine.index  # noqa: B018 (the counters count)
+    assert {"check_points", "_distinct", "reduce_to", "cKDTree", "_described"} <= set(calls)
+
+
+def test_other_settings_than_a_cloud_was_prepared_with_are_refused(pair):
+    cloud = prepare.prepare(pair[0], config=RegisterConfig(search_points=256))
+    with pytest.raises(ValueError, match="source was prepared with another configuration"):
+        register(cloud, pair[1])
+
+
+def test_a_wrong_pose_says_why_and_names_the_others(pair):
+    """`reason` and `alternatives`: of unlike shapes, of a plane, and of a shape with symmetries."""
+    unlike = register(halves(STAIRS)[0], halves(1)[1])
+    assert not unlike.success
+    assert unlike.reason.endswith(".")
+    flat = np.c_[np.random.default_rng(0).uniform(size=(400, 2)), np.zeros(400)]
+    assert "leave the pose free: " in register(flat, flat + 0.001).reason
+    assert register(*pair[:2]).reason == ""
+    box = np.random.default_rng(1).uniform(-1, 1, size=(2, 600, 3)) * [1.0, 0.6, 0.4]
+    side = np.random.default_rng(2).integers(0, 3, size=(2, 600))
+    size = np.array([1.0, 0.6, 0.4])
+    for cloud, axes in zip(box, side, strict=True):
+        rows = np.arange(600)
+        cloud[rows, axes] = np.sign(cloud[rows, axes]) * size[axes]
+    found = register(*box)
+    turns = [angle_deg(other.transform.rotation, found.rotation) for other in found.alternatives]
+    assert sum(turn > 175 for turn in turns) >= 2  # half turns about its axes
+    assert min(other.lead for other in found.alternatives) < 0.1

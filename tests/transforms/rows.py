@@ -20,7 +20,8 @@ class Row:
     differences. `loose` lets Flax promote dtypes. `kinks` is True for the whole network: on a line or
     a grid its moved points are parallel up to rounding, which may differ between the two modes and
     puts them on different sides of a kink. `parts` is True where the row is made of other rows, which
-    are run eagerly and under vmap in its place.
+    are run eagerly and under vmap in its place. `rounding` is how far results may differ that ought to
+    be equal: the search also aligns poses that hardly anything determines, which magnifies rounding.
     """
 
     function: Callable
@@ -30,6 +31,7 @@ class Row:
     loose: bool = False
     kinks: bool = False
     parts: bool = False
+    rounding: float = 1e-10
 
 
 def points(n=N):

@@ -183,13 +183,13 @@ def descriptions() -> dict[str, Row]:
             of_cloud(lambda x, _, d, m: jnp.abs(descriptors.gaussian_normals(x, d, m, radius=2.0))),
             (x, normals, ALL),
             broken,
-            kinks=True,
+            smooth=False,
         ),
         "descriptors.moments": Row(
             of_cloud(functools.partial(descriptors.moments, radii=(3.0, 5.0))),
             (x * [1.5, 1.0, 0.5], normals, ALL),
             broken,
-            kinks=True,
+            smooth=False,
         ),
         "descriptors.openness": Row(
             of_cloud(functools.partial(descriptors.openness, radius=2.0)), (x, normals, ALL), broken
@@ -227,11 +227,17 @@ def whole() -> dict[str, Row]:
         "pipeline.enter": Row(
             entered, (x, y, ALL), tuple((c, c, ALL) for c in clouds_that_break().values())
         ),
-        "stages.search_described": Row(searched, (x, y, ALL, bound), broken, smooth=False),
+        "stages.search_described": Row(
+            searched, (x, y, ALL, bound), broken, smooth=False, rounding=1e-7
+        ),
         "pipeline.search_poses": Row(
-            poses_of(pipeline.search_poses), (x, y, ALL, bound), broken, smooth=False
+            poses_of(pipeline.search_poses), (x, y, ALL, bound), broken, smooth=False, rounding=1e-7
         ),
         "pipeline.register_global": Row(
-            poses_of(pipeline.register_global), (x, y, ALL, bound), broken, smooth=False
+            poses_of(pipeline.register_global),
+            (x, y, ALL, bound),
+            broken,
+            smooth=False,
+            rounding=1e-7,
         ),
     }

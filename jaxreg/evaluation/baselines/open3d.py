@@ -256,10 +256,10 @@ def _tutorial(
     seed: int,
 ) -> RigidTransform:
     """A coarse pose of the thinned clouds, refined on the whole ones."""
-    whole = features = _clouds(source, reference, spacing)
+    whole = x, y = _clouds(source, reference, spacing)
     if _are_dense(*whole, spacing):
-        features = (_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole)
-    return _transform(_to_plane(*whole, coarse(*features, spacing, seed), spacing))
+        x, y = (_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole)
+    return _transform(_to_plane(*whole, coarse(x, y, spacing, seed), spacing))
 
 
 def _are_dense(source: Any, reference: Any, spacing: float) -> bool:
