@@ -117,7 +117,7 @@ def run(options: Options) -> list[dict]:
             result = register(source, reference)
             right = False
             if truth is not None:
-                angle = rotation_angle_deg(result.rotation, truth[:3, :3])
+                angle = rotation_angle_deg(result.rotation[None], truth[None, :3, :3])[0]
                 centre = source.mean(axis=0)
                 change = (result.transformation - truth)[:3]
                 right = angle < 5 and np.linalg.norm(change[:, :3] @ centre + change[:, 3]) < 0.1

@@ -158,7 +158,8 @@ def errors(found: RigidTransform, case: Case) -> tuple[float, float]:
     """Degrees, and metres between where the pose and the truth take the centroid of the source."""
     truth, centre = case.truth, case.source.mean(axis=0)
     apart = (found.rotation - truth[:3, :3]) @ centre + found.translation - truth[:3, 3]
-    return float(rotation_angle_deg(found.rotation, truth[:3, :3])), float(np.linalg.norm(apart))
+    angle = rotation_angle_deg(found.rotation[None], truth[None, :3, :3])[0]
+    return float(angle), float(np.linalg.norm(apart))
 
 
 def row(results: list[Result]) -> dict[str, float | int | None]:

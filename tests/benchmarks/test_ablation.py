@@ -1,12 +1,11 @@
 """The ablation: a row differs in what it is named after and in nothing else; the table is right."""
 
-import dataclasses
 import json
 
 import pytest
 from flax.traverse_util import flatten_dict
 
-from benchmarks.paper import ablation, tables
+from benchmarks.paper import ablation
 from jaxreg.config import to_dict
 
 
@@ -34,20 +33,3 @@ def test_the_table_has_the_mean_and_the_range_of_the_seeds(tmp_path):
         (tmp_path / f"x-{seed}.json").write_text(json.dumps(record))
     *_, line = ablation.table(ablation.Options(workdir=str(tmp_path))).splitlines()
     assert line.startswith("| without L_in | 3 | 0.3 (0.1 to 0.6) |")
-
-
-def test_the_columns_of_the_tables_are_configurations_and_show_their_cells(tmp_path):
-    for column in tables.COLUMNS.values():
-        assert (tables.CONFIGS / f"{column.config}.toml").is_file()
-    options = tables.Options(folder=str(tmp_path))
-    cell = dict.fromkeys(
-        ("mae_r_deg", "mie_r_deg", "mie_r_deg_float32_acos", "median_rre_deg", "mae_t"), 0.25
-    )
-    cell |= {"recall_1deg": 1.0, "worst_rre_deg": 3.0, "worst_pair": 7, "seconds_per_pair": 0.1}
-    cell |= {"row": "identity", "pairs": 9, "dataset": "modelnet40"}
-    (tmp_path / "unseen_objects-identity.json").write_text(json.dumps(cell))
-    text = tables.table("unseen_objects", options)
-    assert "unseen_objects (modelnet40); the paper's MAE(R): 0.0006" in text
-    assert text.splitlines()[-1].startswith("| identity | 9 | 0.25 |")
-    assert "3 (7)" in text
-    assert "nothing evaluated" in tables.table("gaussian_noise", dataclasses.replace(options))
