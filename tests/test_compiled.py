@@ -233,16 +233,16 @@ def test_ten_sizes_in_one_bucket_compile_once(caplog, seed):
     register = jit(functools.partial(register_pair, config=config))
 
     def compilations(size):
-        clouds, masks = zip(
+        points, masks = zip(
             *(
-                clouds.padded(rng.normal(size=(n, 3)), clouds.bucket(n, smallest=256, largest=1024))
+                clouds.padded(rng.normal(size=(n, 3)), clouds.padded_size(n, smallest=256))
                 for n in (size, size - 3)
             ),
             strict=True,
         )
         caplog.clear()
         with jax.log_compiles():
-            register(variables, *clouds, source_mask=masks[0], reference_mask=masks[1])
+            register(variables, *points, source_mask=masks[0], reference_mask=masks[1])
         return [x for x in caplog.messages if x.startswith("Compiling")]
 
     assert len(compilations(300)) == 1
