@@ -44,7 +44,9 @@ class RefineConfig:
     """Surfaces end: their edges must meet, too (generalised ICP)."""
     tolerance: float = 1e-5
     """Converged is a pose whose last step turned by less than this (radians) and moved by less (in
-    radii of the clouds)."""
+    radii of the clouds). A kernel that narrows until the end moves the pose until the end: where you
+    need a fixed point, as for "implicit", let it start narrow (`kernel_annealing` 1) and take more
+    iterations."""
     gradient: Gradient = "unrolled"
     """How the pose is differentiated; its value is the same.
 
