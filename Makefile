@@ -40,7 +40,7 @@ fuzz: $(VENV)/.installed-dev  ## 10,000 examples of whatever may be given to reg
 mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
 	$(BIN)/python tests/mutants.py
 
-baselines: $(VENV)/.installed-baselines  ## install Open3D and small_gicp for the classical rows
+baselines: $(VENV)/.installed-baselines  ## install Open3D, small_gicp and KISS-Matcher for the classical rows
 
 tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (23 minutes)
 	$(BIN)/python -m benchmarks.paper.tables --jobs 2

@@ -32,7 +32,7 @@ Batch = Callable[[Pair], RigidTransform]
 """A batch of pairs (a leading axis on every array) to the stacked transforms; the true ones in it
 must not be read."""
 
-Refinement = Callable[[Pair, RigidTransform], RigidTransform]
+BatchRefinement = Callable[[Pair, RigidTransform], RigidTransform]
 """Better poses of a batch from given ones."""
 
 AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
@@ -221,12 +221,12 @@ def _host(clouds: Callable[[np.ndarray, np.ndarray], Outcome]) -> Method:
     return Method(host_method(lambda x, y: clouds(x, y).transform), clouds)
 
 
-def refined_method(method: Batch, refine: Refinement) -> Batch:
+def refined_method(method: Batch, refine: BatchRefinement) -> Batch:
     """`method`, then a refinement of its poses (both clouds, nothing learned)."""
     return lambda pair: refine(pair, method(pair))
 
 
-def refinement(config: RefineConfig) -> Refinement:
+def refinement(config: RefineConfig) -> BatchRefinement:
     """The ICP family from given poses of a batch."""
 
     def one(source, reference, initial):

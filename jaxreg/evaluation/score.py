@@ -201,7 +201,7 @@ def _keep_first(
         yield pair, count
 
 
-def _refinement(name: str) -> methods.Refinement | None:
+def _refinement(name: str) -> methods.BatchRefinement | None:
     if not name:
         return None
     if name not in _REFINEMENTS:
