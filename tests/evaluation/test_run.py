@@ -165,7 +165,8 @@ def test_a_refinement_is_given_its_configuration_the_masks_and_the_start(shapes,
     monkeypatch.setattr(methods, "refine", recorded)
     found = methods.refinement(config)(pair, pair.transform)
     assert seen["config"] is config
-    added = np.stack([pair.source.mask.sum(1), pair.reference.mask.sum(1), [0] * 5], axis=1).astype(np.float32)
+    counts = [pair.source.mask.sum(1), pair.reference.mask.sum(1), [0] * 5]
+    added = np.stack(counts, axis=1).astype(np.float32)
     np.testing.assert_allclose(found.translation, pair.transform.translation + added, rtol=1e-6)
     np.testing.assert_array_equal(found.rotation, pair.transform.rotation)
 

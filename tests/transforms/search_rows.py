@@ -234,12 +234,14 @@ def whole() -> dict[str, Row]:
     y = x @ turn.T + 0.01 * rng.normal(size=(N, 3))
     broken = (*every(lambda x: (x, x, ALL, bound)), (x, y, ONE, bound), (x, y, NONE, bound))
     entered = lambda x, y, m: pipeline.enter(x, y, m, unit=0.5)  # noqa: E731
-    one = lambda found: best(found) if hasattr(found, "poses") else found.transform  # noqa: E731
-    poses_of = lambda f: (
-        lambda x, y, m, a: one(  # noqa: E731
-            f(x, y, source_mask=m, max_angle=a, config=CONFIG)
-        )
-    )
+
+    def poses_of(function):
+        def pose_of(x, y, mask, angle):
+            found = function(x, y, source_mask=mask, max_angle=angle, config=CONFIG)
+            return best(found) if hasattr(found, "poses") else found.transform
+
+        return pose_of
+
     return {
         "pipeline.enter": Row(
             entered, (x, y, ALL), tuple((c, c, ALL) for c in clouds_that_break().values())
