@@ -3,6 +3,7 @@
 Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted, 130 interrupted.
 """
 
+import dataclasses
 import gc
 import importlib
 import sys
@@ -20,10 +21,12 @@ from jaxreg.cli.view import View
 __all__ = ["main"]
 
 
+@dataclasses.dataclass(frozen=True)
 class _Train:
     """Train a network on pairs that a configuration describes: jaxreg train CONFIG.toml ..."""
 
 
+@dataclasses.dataclass(frozen=True)
 class _Evaluate:
     """Evaluate a network or another method on such pairs: jaxreg evaluate CONFIG.toml ..."""
 

@@ -67,7 +67,7 @@ class Register:
     """Refinement of the pose that the search finds."""
     nonfinite: Literal["raise", "drop"] = "raise"
     """What to do with points that are NaN or infinite."""
-    config: RegisterConfig = RegisterConfig()
+    config: tyro.conf.AvoidSubcommands[RegisterConfig] = RegisterConfig()
     """Settings that the data usually choose well."""
 
     def run(self) -> int:

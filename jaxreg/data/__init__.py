@@ -35,8 +35,8 @@ def data_root(
 ) -> Path | None:
     """The folder of the data sets: `argument` (--data-root), else $JAXREG_DATA, else data/.
 
-    data/ is looked for beside the configuration file. None if there is no such folder and nothing
-    else was asked for.
+    data/ is looked for beside the configuration file, and in the working directory for one that comes
+    with jaxreg. None if there is no such folder and nothing else was asked for.
 
     Raises:
       ValueError: the folder that `argument` or $JAXREG_DATA names does not exist.

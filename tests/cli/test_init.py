@@ -33,3 +33,21 @@ def test_console_script_is_declared():
     project = tomllib.loads((SOURCE_ROOT / "pyproject.toml").read_text())["project"]
     module, _, function = project["scripts"]["jaxreg"].partition(":")
     assert getattr(importlib.import_module(module), function) is main
+
+
+@pytest.mark.parametrize("command", ["register", "info", "view", "train", "evaluate"])
+def test_every_command_has_help_and_takes_its_settings_as_options(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"usage: jaxreg {command}")
+    assert "subcommands" not in out
+
+
+def test_the_list_of_commands_is_complete(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    out = capsys.readouterr().out
+    for path in (SOURCE_ROOT / "jaxreg" / "cli").glob("[a-z]*.py"):
+        assert path.stem in out or path.stem in ("options", "process")
