@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from matplotlib import colormaps
@@ -70,7 +71,7 @@ class Registered(NamedTuple):
 
 def sample_pair(index: int, config: PairConfig, seed: int) -> Pair:
     shape = shapes.sample_shape(seed, FIRST + index, points=config.points)
-    return make_pair(jax.random.fold_in(jax.random.key(seed), index), shape, config)
+    return make_pair(jax.random.fold_in(jax.random.key(seed), index), jnp.asarray(shape), config)
 
 
 def register(pairs: list[Pair], weights: str, model: ModelConfig | None = None) -> list[Registered]:

@@ -22,8 +22,9 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch, name, module):
 def test_a_spacing_is_given_with_the_name():
     pytest.importorskip("open3d")
     chosen = choose("open3d_fgr@0.02")
-    assert chosen.func is choose("open3d_fgr")
-    assert chosen.keywords == {"spacing": 0.02}
+    plain = choose("open3d_fgr")
+    assert chosen.func is plain.func
+    assert chosen.keywords == plain.keywords | {"spacing": 0.02}
     for wrong in ("-1", "nan", "inf", "wide"):
         with pytest.raises(ValueError, match=f"positive number, got '{wrong}'"):
             choose(f"open3d_fgr@{wrong}")

@@ -9,20 +9,23 @@ import numpy as np
 
 from jaxreg.types import RigidTransform
 
-_FUNCTIONS = {
-    "open3d_icp": ("open3d", "icp"),
-    "open3d_icp_point_to_plane": ("open3d", "icp_point_to_plane"),
-    "open3d_icp_coarse_to_fine": ("open3d", "icp_coarse_to_fine"),
-    "open3d_fgr": ("open3d", "fgr"),
-    "open3d_fgr_icp": ("open3d", "fgr_icp"),
-    "open3d_fgr_icp_default": ("open3d", "fgr_icp_default"),
-    "open3d_fgr_gicp": ("open3d", "fgr_gicp"),
-    "open3d_fpfh_ransac": ("open3d", "fpfh_ransac"),
-    "open3d_ransac_icp": ("open3d", "ransac_icp"),
-    "open3d_ransac_gicp": ("open3d", "ransac_gicp"),
-    "small_gicp": ("small_gicp", "gicp"),
-    "kiss_matcher_icp": ("kiss_matcher", "icp"),
+_OPEN3D = {
+    "open3d_icp": ("icp", {}),
+    "open3d_icp_point_to_plane": ("icp", {"to_plane": True}),
+    "open3d_icp_coarse_to_fine": ("icp", {"fine": True}),
+    "open3d_fgr": ("from_features", {"coarse": "fgr", "refinement": "none"}),
+    "open3d_fgr_icp": ("from_features", {"coarse": "fgr", "refinement": "icp"}),
+    "open3d_fgr_icp_default": ("from_features", {"coarse": "fgr_default", "refinement": "icp"}),
+    "open3d_fgr_gicp": ("from_features", {"coarse": "fgr", "refinement": "gicp"}),
+    "open3d_fpfh_ransac": ("from_features", {"coarse": "ransac", "refinement": "none"}),
+    "open3d_ransac_icp": ("from_features", {"coarse": "ransac", "refinement": "icp"}),
+    "open3d_ransac_gicp": ("from_features", {"coarse": "ransac", "refinement": "gicp"}),
 }
+_FUNCTIONS = {name: ("open3d", *rest) for name, rest in _OPEN3D.items()} | {
+    "small_gicp": ("small_gicp", "gicp", {}),
+    "kiss_matcher_icp": ("kiss_matcher", "icp", {}),
+}
+"""The module, the function and the options of every name."""
 NAMES = tuple(_FUNCTIONS)
 """What `choose` takes, alone or with a spacing."""
 
@@ -39,12 +42,13 @@ def choose(name: str) -> Callable[[np.ndarray, np.ndarray], RigidTransform]:
     name, at, spacing = name.partition("@")
     if name not in _FUNCTIONS:
         raise ValueError(f"no classical baseline '{name}': choose one of {', '.join(NAMES)}.")
-    module_name, function_name = _FUNCTIONS[name]
+    module_name, function_name, options = _FUNCTIONS[name]
+    if at:
+        options = options | {"spacing": _positive(spacing)}
     # Imported here: config and metrics must not wait seconds for Open3D, nor need it.
     module = importlib.import_module(f"{__name__}.{module_name}")
     module.require()
-    function = getattr(module, function_name)
-    return functools.partial(function, spacing=_positive(spacing)) if at else function
+    return functools.partial(getattr(module, function_name), **options)
 
 
 def _positive(text: str) -> float:

@@ -17,7 +17,7 @@ def icp(
     """KISS-Matcher with voxels of `spacing`, else its defaults, then Open3D's point-to-plane ICP.
 
     The matcher ends in a pose from features and has no refinement of its own; this one is that of
-    `open3d.ransac_icp`. It runs on several threads, and the same call may give another pose.
+    `open3d_ransac_icp`. It runs on several threads, and the same call may give another pose.
 
     Raises:
       ValueError: a cloud is not finite, not (n, 3) or has fewer than three points; or KISS-Matcher or

@@ -5,11 +5,11 @@ All lengths derive from one, `spacing`, by the ratios of Open3D's tutorial on gl
 normals within 2 of it, FPFH within 5, RANSAC inliers within 1.5, FGR inliers within 0.5. The default
 suits 1024 points on a unit sphere.
 
-`icp`, `icp_point_to_plane`, `fgr` and `fpfh_ransac` are the rows that papers print, of the clouds as
-they are; ICP pairs points within 10 of `spacing`. `icp_coarse_to_fine`, `fgr_gicp` and `ransac_gicp`
-add a refinement within 2 and then 0.6 of it that runs until it has converged. `ransac_icp`, `fgr_icp`
-and `fgr_icp_default` are the tutorial: features of voxels of `spacing`, then point-to-plane ICP on the
-whole clouds with Open3D's own criteria.
+`open3d_icp`, `open3d_icp_point_to_plane`, `open3d_fgr` and `open3d_fpfh_ransac` are rows that papers
+print, of the clouds as they are; ICP pairs points within 10 of `spacing`. `open3d_icp_coarse_to_fine`,
+`open3d_fgr_gicp` and `open3d_ransac_gicp` add a refinement within 2 and then 0.6 of it that runs until
+it has converged. `open3d_ransac_icp`, `open3d_fgr_icp` and `open3d_fgr_icp_default` are the tutorial:
+features of voxels of `spacing`, then point-to-plane ICP on the whole clouds with Open3D's own criteria.
 
 What differs from the tutorial is to Open3D's advantage, as measured. Normals point away from the
 centre of the cloud: see `_oriented`. Clouds that are no denser than the voxels (`_are_dense`) stay as
@@ -17,15 +17,14 @@ they are, instead of losing every fifth point, and their ICP pairs points within
 `spacing` in place of 0.4, within which most of their points have no neighbour. FGR has `decrease_mu`,
 as in its authors' own program (https://github.com/isl-org/FastGlobalRegistration); Open3D's default for
 Python is without, where the distance has no effect and every outlier keeps its pull. That, as in the
-tutorial, is `fgr_icp_default`.
+tutorial, is `open3d_fgr_icp_default`.
 
 Every function takes a source (n, 3) and a reference (m, 3) and raises ValueError when a cloud is
 not finite, not (n, 3), or has fewer than three points, and when Open3D is not installed. Random
 samples are seeded: the same call gives the same transform (GICP to 1e-9, as its sums are threaded).
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -38,112 +37,48 @@ SPACING = 0.05
 _NORMAL_NEIGHBORS, _FPFH_NEIGHBORS = 30, 100
 _ICP_ITERATIONS, _ICP_TOLERANCE = 100, 1e-9
 """Open3D stops after 30 iterations, or at 1e-6, which leaves most exact copies unfinished."""
+Coarse = Literal["fgr", "fgr_default", "ransac"]
 _RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 100_000, 0.999
 
 
 def icp(
-    source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, spacing=SPACING
+    source: Float[np.ndarray, "n 3"],
+    reference: Float[np.ndarray, "m 3"],
+    *,
+    spacing=SPACING,
+    to_plane: bool = False,
+    fine: bool = False,
 ) -> RigidTransform:
-    """Point-to-point ICP from the identity."""
+    """ICP from the identity, point to point or to plane; `fine`: then with the overlap's pairs only."""
     clouds = _clouds(source, reference, spacing)
-    return _transform(_icp(*clouds, np.eye(4), 10 * spacing))
+    estimation = _registration().TransformationEstimationPointToPlane() if to_plane else None
+    pose = _icp(*clouds, np.eye(4), 10 * spacing, estimation)
+    return _transform(_refine(_icp, *clouds, pose, spacing) if fine else pose)
 
 
-def icp_point_to_plane(
-    source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, spacing=SPACING
-) -> RigidTransform:
-    """Point-to-plane ICP from the identity."""
-    clouds = _clouds(source, reference, spacing)
-    estimation = _registration().TransformationEstimationPointToPlane()
-    return _transform(_icp(*clouds, np.eye(4), 10 * spacing, estimation))
-
-
-def icp_coarse_to_fine(
-    source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, spacing=SPACING
-) -> RigidTransform:
-    """Point-to-point ICP, then again with the pairs of the overlap only."""
-    clouds = _clouds(source, reference, spacing)
-    coarse = _icp(*clouds, np.eye(4), 10 * spacing)
-    return _transform(_refine(_icp, *clouds, coarse, spacing))
-
-
-def fgr(
+def from_features(
     source: Float[np.ndarray, "n 3"],
     reference: Float[np.ndarray, "m 3"],
     *,
+    coarse: Coarse,
+    refinement: Literal["none", "icp", "gicp"],
     spacing=SPACING,
     seed: int = 0,
 ) -> RigidTransform:
-    """Fast global registration (Zhou, Park and Koltun, 2016) on FPFH."""
-    return _transform(_fgr(*_clouds(source, reference, spacing), spacing, seed))
+    """Matches of FPFH (Rusu, Blodow and Beetz, 2009), a pose of them, and a refinement of the pose.
 
-
-def fgr_icp(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """FGR, then ICP, as in the tutorial but for `decrease_mu`, which its authors set."""
-    return _tutorial(_fgr, source, reference, spacing=spacing, seed=seed)
-
-
-def fgr_icp_default(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """FGR, then ICP, as in the tutorial: all options that it does not name are Open3D's defaults."""
-    return _tutorial(_fgr_default, source, reference, spacing=spacing, seed=seed)
-
-
-def fgr_gicp(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """FGR refined by generalised ICP."""
-    clouds = _clouds(source, reference, spacing)
-    return _transform(_refine(_gicp, *clouds, _fgr(*clouds, spacing, seed), spacing))
-
-
-def fpfh_ransac(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """RANSAC over triplets of FPFH matches (Rusu, Blodow and Beetz, 2009)."""
-    return _transform(_ransac(*_clouds(source, reference, spacing), spacing, seed))
-
-
-def ransac_icp(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """FPFH + RANSAC, then ICP, as in the tutorial."""
-    return _tutorial(_ransac, source, reference, spacing=spacing, seed=seed)
-
-
-def ransac_gicp(
-    source: Float[np.ndarray, "n 3"],
-    reference: Float[np.ndarray, "m 3"],
-    *,
-    spacing=SPACING,
-    seed: int = 0,
-) -> RigidTransform:
-    """FPFH + RANSAC refined by generalised ICP."""
-    clouds = _clouds(source, reference, spacing)
-    return _transform(_refine(_gicp, *clouds, _ransac(*clouds, spacing, seed), spacing))
+    `coarse` is fast global registration (Zhou, Park and Koltun, 2016) or RANSAC over triplets of
+    matches; `refinement` "icp" is the tutorial, with features of voxels.
+    """
+    whole = features = _clouds(source, reference, spacing)
+    if refinement == "icp" and _are_dense(*whole, spacing):
+        features = [_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole]
+    pose = _coarse(*features, coarse, spacing=spacing, seed=seed)
+    if refinement == "icp":
+        pose = _to_plane(*whole, pose, spacing)
+    if refinement == "gicp":
+        pose = _refine(_gicp, *whole, pose, spacing)
+    return _transform(pose)
 
 
 def refined(
@@ -207,34 +142,31 @@ def _fpfh(cloud: Any, spacing: float) -> Any:
     return _registration().compute_fpfh_feature(cloud, search)
 
 
-def _fgr(
-    source: Any, reference: Any, spacing: float, seed: int, *, decrease_mu: bool = True
+def _coarse(
+    source: Any, reference: Any, method: Coarse, *, spacing: float, seed: int
 ) -> np.ndarray:
     require().utility.random.seed(seed)
+    features = _fpfh(source, spacing), _fpfh(reference, spacing)
+    if method == "ransac":
+        return _ransac(source, reference, *features, spacing)
     module = _registration()
+    option = module.FastGlobalRegistrationOption(
+        decrease_mu=method == "fgr", maximum_correspondence_distance=0.5 * spacing
+    )
     return module.registration_fgr_based_on_feature_matching(
-        source,
-        reference,
-        _fpfh(source, spacing),
-        _fpfh(reference, spacing),
-        module.FastGlobalRegistrationOption(
-            decrease_mu=decrease_mu, maximum_correspondence_distance=0.5 * spacing
-        ),
+        source, reference, *features, option
     ).transformation
 
 
-def _fgr_default(source: Any, reference: Any, spacing: float, seed: int) -> np.ndarray:
-    return _fgr(source, reference, spacing, seed, decrease_mu=False)
-
-
-def _ransac(source: Any, reference: Any, spacing: float, seed: int) -> np.ndarray:
-    require().utility.random.seed(seed)
+def _ransac(
+    source: Any, reference: Any, source_fpfh: Any, reference_fpfh: Any, spacing: float
+) -> np.ndarray:
     module, distance = _registration(), 1.5 * spacing
     return module.registration_ransac_based_on_feature_matching(
         source,
         reference,
-        _fpfh(source, spacing),
-        _fpfh(reference, spacing),
+        source_fpfh,
+        reference_fpfh,
         True,  # Mutual matches only.
         distance,
         module.TransformationEstimationPointToPoint(False),
@@ -245,21 +177,6 @@ def _ransac(source: Any, reference: Any, spacing: float, seed: int) -> np.ndarra
         ],
         module.RANSACConvergenceCriteria(_RANSAC_ITERATIONS, _RANSAC_CONFIDENCE),
     ).transformation
-
-
-def _tutorial(
-    coarse: Callable[[Any, Any, float, int], np.ndarray],
-    source: np.ndarray,
-    reference: np.ndarray,
-    *,
-    spacing: float,
-    seed: int,
-) -> RigidTransform:
-    """A coarse pose of the thinned clouds, refined on the whole ones."""
-    whole = x, y = _clouds(source, reference, spacing)
-    if _are_dense(*whole, spacing):
-        x, y = (_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole)
-    return _transform(_to_plane(*whole, coarse(x, y, spacing, seed), spacing))
 
 
 def _are_dense(source: Any, reference: Any, spacing: float) -> bool:
