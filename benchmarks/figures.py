@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
 from benchmarks.search_figure import draw_search
-from jaxreg._xla import jit
 from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import ModelConfig, PairConfig
 from jaxreg.data.batches import key_of_tests, pair_batches
@@ -76,7 +75,7 @@ def sample_pair(index: int, config: PairConfig, seed: int) -> Pair:
 
 def register(pairs: list[Pair], weights: str, model: ModelConfig | None = None) -> list[Registered]:
     variables, config = load_pretrained(weights)
-    one = jit(
+    one = jax.jit(
         lambda s, r: iterate(
             variables, s, r, config=model or config.model, observe=lambda step, _: step.confidence
         )[:2]

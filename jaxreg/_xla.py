@@ -3,9 +3,6 @@
 Each was measured on jaxlib 0.10 (benchmarks/speed/speed.py shows the stages); check again on a new one.
 """
 
-import functools
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Shaped
@@ -65,57 +62,12 @@ def gradient_written_out(x: Shaped[Array, "*n c"]) -> Shaped[Array, "*n c"]:
     return jax.lax.custom_linear_solve(lambda x: x, x, solve=lambda _, x: x, transpose_solve=write)
 
 
-"""How this library compiles and runs on a CPU: compiler options, the cache on disk, memory pages."""
+def unfused(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`x`, after which a kernel of XLA:CPU ends: for a large product that arithmetic follows.
 
-
-# XLA:CPU fuses softmax -> products -> exp -> softmax into one kernel that runs several times slower
-# than its parts (measured on jaxlib 0.10; benchmarks/ compares both on the machine at hand).
-_CPU_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
-
-
-def jit(function: Callable, **options) -> Callable:
-    """`jax.jit` with the compiler options that the default backend wants; `options` are jit's.
-
-    They are chosen when the result is first used: until then no backend is started, so that a
-    program may import this library and configure JAX afterwards. JAX takes compiler options for whole
-    programs only: the result is called as it is or under `jax.vmap`, and not within another `jax.jit`
-    or under `jax.grad`; give those the function, and this what they return.
+    XLA:CPU hands products to the library YNN together with the arithmetic around them, which costs a
+    fifth more than the product and the arithmetic in two kernels. YNN has no `reduce_precision`, and
+    to the precision that `x` has it changes no bit; other backends drop it.
     """
-
-    @functools.cache
-    def jitted() -> Callable:
-        chosen = _chosen_options() | options.get("compiler_options", {})
-        return jax.jit(function, **options | {"compiler_options": chosen})
-
-    @functools.wraps(function)
-    def call(*arguments, **keywords):
-        return jitted()(*arguments, **keywords)
-
-    for name in ("lower", "trace", "eval_shape", "clear_cache", "_cache_size"):
-        setattr(call, name, _method(jitted, name))
-    return call
-
-
-def _method(jitted: Callable[[], Callable], name: str) -> Callable:
-    return lambda *arguments, **keywords: getattr(jitted(), name)(*arguments, **keywords)
-
-
-def _chosen_options() -> dict[str, str]:
-    if jax.default_backend() == "cpu" and _known(tuple(_CPU_OPTIONS.items())):
-        return _CPU_OPTIONS
-    return {}
-
-
-@functools.cache
-def _known(options: tuple[tuple[str, str], ...]) -> bool:
-    """Whether XLA takes `options`, tried once on an empty program.
-
-    XLA drops experimental options without notice, and would then compile nothing at all. Costs some
-    9 ms of a start: most of what it takes, the first program would take instead.
-    """
-    try:
-        with jax.log_compiles(False):  # One who counts programs looks for those of his own.
-            jax.jit(lambda: None, compiler_options=dict(options)).lower().compile()
-    except (jax.errors.JaxRuntimeError, ValueError):
-        return False
-    return True
+    precision = jnp.finfo(x.dtype)
+    return jax.lax.reduce_precision(x, precision.nexp, precision.nmant)

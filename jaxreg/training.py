@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxreg._extras import extra
-from jaxreg._xla import jit
 from jaxreg.config import Config, TrainConfig
 from jaxreg.data import load_training, training_label
 from jaxreg.data.batches import pair_batches, validation_key
@@ -143,7 +142,7 @@ def train_step(
     ), logged
 
 
-_train_step_jit = jit(train_step, static_argnames="config", donate_argnums=0)
+_train_step_jit = jax.jit(train_step, static_argnames="config", donate_argnums=0)
 
 
 def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[str, float]:

@@ -25,7 +25,6 @@ import optax
 import tyro
 
 from benchmarks.scans import protocols
-from jaxreg import _xla
 from jaxreg.cli import process
 from jaxreg.config import ModelConfig
 from jaxreg.data.procedural import shapes
@@ -159,7 +158,7 @@ def init_weights(key: jax.Array) -> dict:
     }
 
 
-@_xla.jit
+@jax.jit
 def training_pairs(network, keys, clouds):
     """Pairs of the protocol, described, and the points of each source at the true pose."""
 
@@ -185,7 +184,7 @@ def fit(row: Row, network, clouds: np.ndarray, seed: int, options: Options) -> d
         apart = rigid.apply(pose, described.x) - truth
         return jnp.mean(jnp.sum(jnp.abs(apart), axis=1)), statistics
 
-    @_xla.jit
+    @jax.jit
     def step(trained, statistics, state, described, truth):
         def loss(trained):
             each = jax.vmap(pair_loss, in_axes=(None, None, 0, 0), axis_name=BATCH_AXIS)
@@ -234,7 +233,7 @@ def test(solve, pairs: list[Pair]) -> tuple[float, float]:
 def solver(row: Row, network, weights):
     """One pair to a pose, compiled."""
 
-    @_xla.jit
+    @jax.jit
     def solve(described: Described) -> RigidTransform:
         pose, _ = register_step(weights, described, row, train=False)
         return frame.transform_out(described.where, pose)
@@ -242,7 +241,7 @@ def solver(row: Row, network, weights):
     return lambda x, y: solve(describe_once(network, x, y))
 
 
-describe_once = _xla.jit(describe)
+describe_once = jax.jit(describe)
 
 
 def main() -> None:
@@ -255,7 +254,7 @@ def main() -> None:
     name = "ModelNet40" if "ModelNet40" in sets else "procedural"
     pairs = {kind: draw_pairs(kind, sets[name], options) for kind in TESTED}
     print(f"{options.pairs} pairs of {name}: median degrees / recall at 5 degrees and 0.1")
-    searched = _xla.jit(
+    searched = jax.jit(
         lambda x, y: jax.tree.map(lambda p: p[0], search_poses(x, y, network=network).poses)
     )
     results = {"the search of register_global": [{k: test(searched, p) for k, p in pairs.items()}]}

@@ -26,7 +26,6 @@ import optax
 import tyro
 
 from benchmarks.scans import protocols
-from jaxreg import _xla
 from jaxreg.cli import process
 from jaxreg.config import load_config
 from jaxreg.data import data_root, modelnet
@@ -104,7 +103,7 @@ def choices(options: Options):
 
         return search, jax.lax.map(judge, search.poses)
 
-    return _xla.jit(found)
+    return jax.jit(found)
 
 
 def collect(find, pair: Pair) -> Choice:

@@ -28,7 +28,6 @@ import optax
 import tyro
 
 from benchmarks.scans import protocols
-from jaxreg import _xla
 from jaxreg.cli import process
 from jaxreg.config import PairConfig, load_config
 from jaxreg.data import data_root
@@ -148,7 +147,7 @@ def fit(name: str, clouds: np.ndarray, options: Options) -> Any:
         cosines = COSINES[name](weights["features"], x, y, *masks)
         return contrastive_loss(cosines, jnp.exp(weights["log_sharpness"]), squared, *masks)
 
-    @functools.partial(_xla.jit, static_argnames="kind")
+    @functools.partial(jax.jit, static_argnames="kind")
     def step(weights, state, key, chosen, kind: str):
         config = pair_config(kind)
         draw_key, mask_key, share_key = jax.random.split(key, 3)
@@ -185,7 +184,7 @@ def fit(name: str, clouds: np.ndarray, options: Options) -> Any:
 def search(name: str, weights: Any):
     """A compiled search of a pair: the aligned poses, and the share of true best matches."""
 
-    @_xla.jit
+    @jax.jit
     def found(x, y, truth):
         masks = [jnp.ones(len(p), bool) for p in (x, y)]
         _, a, b = enter(x, y, *masks)

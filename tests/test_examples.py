@@ -23,8 +23,3 @@ def test_implicit_gradient_is_that_of_the_iterations(capsys):
     unrolled, implicit = (np.asarray(example["influence"](g)) for g in ("unrolled", "implicit"))
     np.testing.assert_allclose(implicit, unrolled, atol=1e-3 * unrolled.max())
     assert "implicit" in capsys.readouterr().out
-
-
-def test_examples_stay_short():
-    for path in EXAMPLES.glob("*.py"):
-        assert len(path.read_text(encoding="utf-8").splitlines()) < 60, path.name

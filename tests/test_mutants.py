@@ -4,6 +4,9 @@ import pytest
 
 from tests import mutants
 
+UNBROKEN = {"peers", "view"}
+"""Rooms without a mutant: one needs weights that may be absent, the other draws."""
+
 
 @pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda m: f"{m.module}: {m.text}")
 def test_text_stands_once_and_the_test_exists(mutant):
@@ -14,5 +17,6 @@ def test_text_stands_once_and_the_test_exists(mutant):
     assert f"def {name.partition('[')[0]}(" in tests
 
 
-def test_there_are_many():
-    assert len(mutants.MUTANTS) >= 15
+def test_every_room_is_broken_somewhere():
+    rooms = {path.parent.name for path in (mutants.ROOT / "jaxreg").glob("*/__init__.py")}
+    assert rooms - {mutant.module.partition(".")[0] for mutant in mutants.MUTANTS} == UNBROKEN

@@ -46,17 +46,24 @@ def config() -> Config:
     )
 
 
+@functools.cache
+def loss_of(config: Config):
+    return jax.jit(functools.partial(training.batch_loss, config=config))
+
+
+@functools.cache
+def gradient_of(config: Config):
+    return jax.jit(jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True))
+
+
 def test_the_true_transform_changes_no_gradient(config, seed):
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
     pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
     lie = RigidTransform(*jax.tree.map(lambda x: x * 0 + seed + 7.0, pairs.transform))
     state = training.create_train_state(config)
-    gradient = jax.jit(
-        jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True)
-    )
     arguments = state.variables["params"], state.variables["batch_stats"]
-    honest, _ = gradient(*arguments, pairs)
-    lied, _ = gradient(*arguments, pairs._replace(transform=lie))
+    honest, _ = gradient_of(config)(*arguments, pairs)
+    lied, _ = gradient_of(config)(*arguments, pairs._replace(transform=lie))
     assert any(jnp.any(leaf != 0) for leaf in jax.tree.leaves(honest))
     jax.tree.map(np.testing.assert_array_equal, honest, lied)
 
@@ -67,15 +74,15 @@ def test_the_pose_loss_reads_the_true_transform_and_nothing_else_changes(config,
     pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
     state = training.create_train_state(config)
     arguments = state.variables["params"], state.variables["batch_stats"], pairs
-    loss, (terms, _) = jax.jit(functools.partial(training.batch_loss, config=config))(*arguments)
-    total, (more, _) = jax.jit(functools.partial(training.batch_loss, config=posed))(*arguments)
+    loss, (terms, _) = loss_of(config)(*arguments)
+    total, (more, _) = loss_of(posed)(*arguments)
     error = more.pop("pose_error")
     assert set(terms) == set(more)
     np.testing.assert_allclose(total, loss + 2 * error, rtol=1e-5)
     # Where the true pose is a thousand away from any other, every point of every step is.
     far = pairs.transform._replace(translation=pairs.transform.translation + 1000.0)
     lied = (*arguments[:2], pairs._replace(transform=far))
-    _, (away, _) = jax.jit(functools.partial(training.batch_loss, config=posed))(*lied)
+    _, (away, _) = loss_of(posed)(*lied)
     steps, points = config.model.iterations, config.pairs.kept
     np.testing.assert_allclose(away["pose_error"], steps * points * 1000 * 3**0.5, rtol=0.01)
     assert error < away["pose_error"] / 100
@@ -87,10 +94,8 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     state = training.create_train_state(config)
     pairs = training.draw_batch(state.step, shapes, config)
     params, statistics = state.variables["params"], state.variables["batch_stats"]
-    loss = jax.jit(functools.partial(training.batch_loss, config=config))
-    gradient, _ = jax.jit(
-        jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True)
-    )(params, statistics, pairs)
+    loss = loss_of(config)
+    gradient, _ = gradient_of(config)(params, statistics, pairs)
     square = sum(jnp.sum(g * g) for g in jax.tree.leaves(gradient))
     before, _ = loss(params, statistics, pairs)
     length = 1e-3 * before / square

@@ -1,77 +1,64 @@
-"""`compilation.jit`: jax.jit in all it does, with options that may vanish and that start nothing."""
-
-import functools
-import os
-import subprocess
-import sys
+"""The reformulations for XLA:CPU are identities, of any shape and dtype, in value and derivative."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from jaxreg import _xla
-
-pytestmark = [pytest.mark.float32, pytest.mark.loose]
-
-UNKNOWN = {"xla_no_such_option": ""}
-
-# Fails in the second line where a backend has been started.
-CONFIGURED_AFTERWARDS = """
-import jax, jaxreg.training, jaxreg.evaluation.score, jaxreg.scans, jaxreg.search
-jax.config.update("jax_num_cpu_devices", 2)
-assert len(jax.devices()) == 2
-"""
+from jaxreg._xla import at_row_min, gradient_written_out, row_min, unfused, written_out
 
 
-def test_importing_the_library_starts_no_backend():
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    subprocess.run([sys.executable, "-c", CONFIGURED_AFTERWARDS], env=environment, check=True)
+@pytest.mark.parametrize("width", [1, 2, 3, 7, 16, 33, 50])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int32"])
+def test_minimum_of_rows_of_any_width(seed, width, dtype):
+    x = np.random.default_rng(seed).normal(0, 100, (5, width)).astype(dtype)
+    np.testing.assert_array_equal(jax.jit(row_min)(x), x.min(axis=1))
 
 
-def test_it_is_as_jax_jit():
-    def power(x, *, n):
-        """Raised."""
-        traced.append(n)
-        return x**n
-
-    traced = []
-    jitted = functools.partial(_xla.jit, static_argnames="n")(power)
-    assert (jitted.__name__, jitted.__doc__) == ("power", "Raised.")
-    assert [float(jitted(2.0, n=3)), float(jitted(3.0, n=3))] == [8.0, 27.0]
-    assert traced == [3]
-    assert jitted._cache_size() == 1
-    assert jax.vmap(lambda x: jitted(x, n=2))(jnp.arange(3.0)).tolist() == [0.0, 1.0, 4.0]
-    slope = _xla.jit(jax.grad(lambda x: power(x, n=3)))
-    assert slope(2.0) == 12.0
-    number = jax.ShapeDtypeStruct((), jnp.float32)
-    assert jitted.lower(number, n=2).compile()(jnp.float32(3)) == 9.0
-    assert jitted.eval_shape(number, n=2) == number
-    assert jitted.trace(number, n=2).jaxpr.in_avals[0].shape == ()
-    jitted.clear_cache()
-    assert jitted._cache_size() == 0
+def test_minimum_sees_infinity_and_nan():
+    x = np.array([[np.inf, 2, np.inf], [np.inf] * 3, [1, np.nan, 0]])
+    np.testing.assert_array_equal(jax.jit(row_min)(x), [2, np.inf, np.nan])
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="other backends get no options")
-def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
-    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
-        jax.jit(lambda x: 2 * x, compiler_options=UNKNOWN)(1.0)
-    monkeypatch.setattr(_xla, "_CPU_OPTIONS", UNKNOWN)
-    double = _xla.jit(lambda x: 2 * x)
-    assert double(3.0) == 6.0
-    assert double.lower(3.0).compile()(3.0) == 6.0
+def test_the_place_of_the_minimum_forgives_the_last_bit():
+    x = np.array([[3, 1, 1 + 2e-16, 1.001], [np.inf] * 4, [0, 1e-300, 0, 5], [-2, 2, -2, -1.999]])
+    expected = [[0, 1, 1, 0], [1, 1, 1, 1], [1, 0, 1, 0], [1, 0, 1, 0]]
+    np.testing.assert_array_equal(jax.jit(at_row_min)(x), expected)
 
 
-def test_options_of_the_caller_are_not_left_out():
-    double = _xla.jit(lambda x: 2 * x, compiler_options=UNKNOWN)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_no_such_option"):
-        double(1.0)
+@pytest.mark.parametrize("shape", [(1, 4), (2, 1), (5, 3), (8, 2, 3)])
+def test_writing_out_changes_nothing(seed, shape):
+    x = np.random.default_rng(seed).normal(size=(2, *shape))
+    np.testing.assert_array_equal(jax.jit(jax.vmap(written_out))(x), x)
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="other backends get no options")
-def test_what_xla_knows_is_tried_once_and_counts_as_no_program_of_the_caller(caplog):
-    options = {"xla_dump_to": ""}
-    with jax.log_compiles():
-        assert _xla._known(tuple(options.items()))
-        assert _xla._known(tuple(options.items()))
-    assert not [text for text in caplog.messages if text.startswith("Compiling")]
-    assert _xla._known.cache_info().hits >= 1
+def test_a_gradient_written_out_is_the_gradient(seed):
+    rng = np.random.default_rng(seed)
+    x, tangent, target = rng.normal(size=(3, 4, 5, 6))
+
+    def value(x):
+        return jnp.sum(jnp.sin(gradient_written_out(x)) * target)
+
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(x), np.cos(x) * target, atol=1e-15)
+    derivative = jax.jit(lambda x, t: jax.jvp(value, (x,), (t,))[1])(x, tangent)
+    np.testing.assert_allclose(derivative, np.sum(np.cos(x) * target * tangent), rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_what_is_unfused_is_the_same_to_the_last_bit(seed, dtype):
+    bits = np.random.default_rng(seed).integers(-(2**62), 2**62, 500)
+    x = np.concatenate([bits.view(dtype), np.array([0.0, -0.0, np.inf, -np.inf], dtype)])
+    x = x[~np.isnan(x)]
+    unsigned = f"u{x.dtype.itemsize}"
+    np.testing.assert_array_equal(
+        np.asarray(jax.jit(jax.vmap(unfused))(x)).view(unsigned), x.view(unsigned)
+    )
+    assert np.isnan(unfused(jnp.asarray(np.nan, dtype)))
+
+
+def test_the_derivative_of_what_is_unfused_is_one(seed):
+    x, tangent = np.random.default_rng(seed).normal(size=(2, 7))
+    value, derivative = jax.jvp(unfused, (x,), (tangent,))
+    np.testing.assert_array_equal(value, x)
+    np.testing.assert_array_equal(derivative, tangent)
+    np.testing.assert_array_equal(jax.vjp(unfused, x)[1](jnp.asarray(tangent))[0], tangent)

@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.paper import transcription
 from benchmarks.speed import workload
-from jaxreg._xla import jit
 from jaxreg.evaluation.metrics import euler_zyx_deg
 from jaxreg.geometry import rigid
 from jaxreg.geometry.rigid import rotation_angle_deg
@@ -78,7 +77,7 @@ def variants(batch: int) -> dict[str, Rotations]:
     _, config = workload.released()
     as_it_is = functools.partial(model.register_pair, config=config)
 
-    def batched(one, compiler=jit, **replaced) -> Rotations:
+    def batched(one, compiler=jax.jit, **replaced) -> Rotations:
         many = compiler(jax.vmap(lambda v, x, y: one(v, x, y).rotation, in_axes=(None, 0, 0)))
 
         def run(variables, sources, references):
@@ -91,7 +90,7 @@ def variants(batch: int) -> dict[str, Rotations]:
 
         return run
 
-    single = jit(lambda v, x, y: as_it_is(v, x, y).rotation)
+    single = jax.jit(lambda v, x, y: as_it_is(v, x, y).rotation)
 
     def one_at_a_time(variables, sources, references):
         pairs = zip(sources, references, strict=True)
@@ -100,7 +99,7 @@ def variants(batch: int) -> dict[str, Rotations]:
     written = functools.partial(transcription.register, config=config.model)
     return {
         "the library": batched(as_it_is),
-        "compiled with XLA's fusion of softmax and products": batched(as_it_is, jax.jit),
+        "compiled without the library YNN": batched(as_it_is, workload.jit_without_ynn),
         "neighbours by sorting": batched(as_it_is, knn=_sorted_neighbors),
         "neighbourhood sums by indexing": batched(as_it_is, neighborhood_sum=_sum_by_indexing),
         "matching in blocks of rows": batched(as_it_is, LARGEST=0),

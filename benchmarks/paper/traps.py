@@ -2,7 +2,7 @@
 
     python -m benchmarks.paper.traps [--points 768] [--batch 8] [--only forward search sum loop]
 
-`forward` a batch pair by pair and at once, and with the compiler's fusion of softmax and products
+`forward` a batch pair by pair and at once, and compiled without the library YNN
 `search`  neighbours by one selection, by a selection that slices turn into a sort, by sorting rows
 `sum`     the neighbourhood sum and its gradient: row gathers in loops, indexing, 0/1 matrices
 `loop`    seconds to compile the gradient of the iterations as a loop, and written out
@@ -25,7 +25,6 @@ from jax.lax import Precision
 from benchmarks import record
 from benchmarks.paper import transcription
 from benchmarks.speed import timing, workload
-from jaxreg._xla import jit
 from jaxreg.batching import map_pairs
 from jaxreg.geometry import neighbors, rigid
 from jaxreg.network import matching
@@ -48,7 +47,7 @@ class Options:
 
 
 def forward(options: Options) -> dict[str, Callable]:
-    """The same function with and without the library's compiler options, and as `vmap` has it."""
+    """The same function as `vmap` has it, and as XLA compiles it without YNN."""
     variables, config = workload.released()
     clouds = [jnp.asarray(x) for x in workload.draw(options.points, options.batch)[:2]]
 
@@ -57,9 +56,9 @@ def forward(options: Options) -> dict[str, Callable]:
 
     loop, at_once = (functools.partial(many, way) for way in (map_pairs, jax.vmap))
     programs = {
-        "forward pass, pair by pair": jit(loop),
-        "forward pass, the batch at once (vmap)": jit(at_once),
-        "forward pass, pair by pair, as jax.jit compiles it": jax.jit(loop),
+        "forward pass, pair by pair": jax.jit(loop),
+        "forward pass, the batch at once (vmap)": jax.jit(at_once),
+        "forward pass, pair by pair, without YNN": workload.jit_without_ynn(loop),
     }
     return {name: lambda _, f=program: f(variables, *clouds) for name, program in programs.items()}
 
@@ -79,7 +78,7 @@ def search(options: Options) -> dict[str, Callable]:
         "neighbours, a selection that is sliced twice": sliced,
         "neighbours, every row sorted": functools.partial(transcription.neighborhoods, k=k),
     }
-    compiled = {name: jit(jax.vmap(program)) for name, program in programs.items()}
+    compiled = {name: jax.jit(jax.vmap(program)) for name, program in programs.items()}
     return {name: lambda _, f=program: f(clouds) for name, program in compiled.items()}
 
 
@@ -100,7 +99,7 @@ def sums(options: Options) -> dict[str, Callable]:
     scores = jnp.asarray(rng.uniform(size=(options.batch, n, n)), jnp.float32)
     clouds = workload.draw(n, options.batch)[:2]
     graphs = [jax.vmap(lambda x: neighbors.knn(x, k))(jnp.asarray(x)) for x in clouds]
-    both_ways = jit(jax.vmap(matching.incidence))
+    both_ways = jax.jit(jax.vmap(matching.incidence))
     candidates = {
         "gathers in loops": (matching.neighborhood_sum, [both_ways(g) for g in graphs]),
         "indexing": (transcription.neighborhood_sum, graphs),
@@ -110,7 +109,7 @@ def sums(options: Options) -> dict[str, Callable]:
     for name, (function, graph) in candidates.items():
         loss = lambda x, p, q, f=function: jnp.sum(f(x, p, q) ** 2)  # noqa: E731
         for label, program in (("sum", function), ("sum and gradient", jax.grad(loss))):
-            compiled = jit(jax.vmap(program))
+            compiled = jax.jit(jax.vmap(program))
             tasks[f"{label}, {name}"] = lambda _, f=compiled, g=graph: f(scores, *g)
     return dict(sorted(tasks.items(), key=lambda item: "gradient" in item[0]))
 
@@ -133,7 +132,7 @@ def loop(options: Options) -> dict[str, float]:
     found = {}
     for name, program in (("in a loop", looped), ("written out", written_out)):
         begin = time.perf_counter()
-        jit(jax.grad(program)).lower(variables, *clouds).compile()
+        jax.jit(jax.grad(program)).lower(variables, *clouds).compile()
         found[f"compile the gradient, iterations {name}"] = time.perf_counter() - begin
     return found
 
@@ -175,9 +174,9 @@ ROWS = {
         "compile the gradient, iterations written out",
     ),
     "fusion": (
-        "XLA's fusion of softmax and products: off; on",
+        "XLA's kernels of the library YNN: on; off",
         "forward pass, pair by pair",
-        "forward pass, pair by pair, as jax.jit compiles it",
+        "forward pass, pair by pair, without YNN",
     ),
 }
 """Rows of the record: what a reader sees, what the library does, and the one or two other ways."""

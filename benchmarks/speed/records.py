@@ -36,7 +36,7 @@ PROGRAMS = {
 }
 VARIANTS = {
     "library": "the library",
-    "fusion": "compiled with XLA's fusion of softmax and products",
+    "fusion": "compiled without the library YNN",
     "sorting": "neighbours by sorting",
     "indexing": "neighbourhood sums by indexing",
     "blocks": "matching in blocks of rows",

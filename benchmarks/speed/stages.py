@@ -19,10 +19,10 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from benchmarks.speed import timing, workload
-from jaxreg._xla import jit
 from jaxreg.batching import map_pairs
 from jaxreg.config import ModelConfig
 from jaxreg.geometry.numerics import safe_sqrt
@@ -66,11 +66,13 @@ def stages(points: int, batch: int) -> dict[str, Stage]:
     config, drawn = whole.model, workload.draw(points, batch)
     sources, references = (jnp.asarray(x) for x in drawn[:2])
     mask = jnp.ones(points, bool)
-    of_cloud = jit(map_pairs(lambda x: model.neighborhood_graph(PointCloud(x, mask), config)))
-    of_points = jit(
+    of_cloud = jax.jit(map_pairs(lambda x: model.neighborhood_graph(PointCloud(x, mask), config)))
+    of_points = jax.jit(
         map_pairs(lambda x, g: model.point_features(variables, x, g, mask, config=config)[0])
     )
-    distances, of_nearest, to_maps, to_copy = map(jit, map(map_pairs, _matching_programs(config)))
+    distances, of_nearest, to_maps, to_copy = map(
+        jax.jit, map(map_pairs, _matching_programs(config))
+    )
     trust, solve = _inlier_programs(variables, config)
     graphs = of_cloud(sources), of_cloud(references)
     features = [of_points(x, g) for x, g in zip((sources, references), graphs, strict=True)]
@@ -131,7 +133,7 @@ def _inlier_programs(variables, config: ModelConfig) -> tuple[Callable, Callable
         chosen = select_inliers(confidence, config.n_inliers)
         return weighted_procrustes(source[chosen], copy[chosen], confidence[chosen])
 
-    return jit(map_pairs(trust)), jit(map_pairs(solve))
+    return jax.jit(map_pairs(trust)), jax.jit(map_pairs(solve))
 
 
 def measure(points: int, batch: int, *, rounds: int) -> tuple[list[dict], dict, float]:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper import transcription
 from jaxreg import training
-from jaxreg._xla import jit
 from jaxreg.batching import map_pairs
 from jaxreg.config import Config, PairConfig
 from jaxreg.data.procedural import shapes
@@ -20,6 +19,10 @@ from jaxreg.network.model import register_pair
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from jaxreg.weights.released import load_pretrained
 
+jit_without_ynn = functools.partial(
+    jax.jit, compiler_options={"xla_cpu_experimental_ynn_fusion_type": ""}
+)
+"""`jax.jit`, but XLA:CPU hands nothing to the library YNN: see `jaxreg._xla.unfused`."""
 Implementation = Literal["jaxreg", "transcription"]
 
 
@@ -64,17 +67,16 @@ def registration(implementation: Implementation, *, batched: bool) -> Callable:
     """The compiled function of variables and two clouds (n, 3), or two batches of them.
 
     `jaxreg` is the library, with batches as `evaluate.py` takes them; `transcription` is the equations
-    as one would first write them, compiled as `jax.jit` does by default.
+    as one would first write them.
     """
     _, config = released()
     if implementation == "jaxreg":
-        compiler, one = jit, functools.partial(register_pair, config=config)
+        batch, one = map_pairs, functools.partial(register_pair, config=config)
     else:
-        compiler, one = jax.jit, functools.partial(transcription.register, config=config.model)
+        batch, one = jax.vmap, functools.partial(transcription.register, config=config.model)
     if not batched:
-        return compiler(one)
-    batch = map_pairs if implementation == "jaxreg" else jax.vmap
-    return compiler(lambda variables, *clouds: batch(functools.partial(one, variables))(*clouds))
+        return jax.jit(one)
+    return jax.jit(lambda variables, *clouds: batch(functools.partial(one, variables))(*clouds))
 
 
 def training_config(points: int, batch: int) -> Config:
@@ -90,15 +92,15 @@ def training_config(points: int, batch: int) -> Config:
 def gradient(implementation: Implementation, config: Config) -> Callable:
     """Compiled loss and gradient of a batch of pairs."""
     if implementation == "jaxreg":
-        compiler, loss, aux = jit, training.batch_loss, True
+        loss, aux = training.batch_loss, True
     else:
-        compiler, loss, aux = jax.jit, transcription.batch_loss, False
-    return compiler(jax.value_and_grad(functools.partial(loss, config=config), has_aux=aux))
+        loss, aux = transcription.batch_loss, False
+    return jax.jit(jax.value_and_grad(functools.partial(loss, config=config), has_aux=aux))
 
 
 def training_step(config: Config) -> Callable:
     """The compiled step of `train.py`: pairs, gradient, optimiser."""
-    return jit(functools.partial(training.train_step, config=config), donate_argnums=0)
+    return jax.jit(functools.partial(training.train_step, config=config), donate_argnums=0)
 
 
 def loss_inputs(implementation: Implementation, drawn: Batch) -> tuple:

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from jaxreg._xla import jit
 from jaxreg.config import PairConfig
 from jaxreg.data.pairs import make_pair, make_pair_from_scans
 from jaxreg.geometry import rigid
@@ -31,7 +30,7 @@ def _make_batch(key, numbers, shapes, *, config: PairConfig) -> Pair:
     return jax.vmap(one)(numbers, shapes)
 
 
-_make_batch_jit = jit(_make_batch, static_argnames="config")
+_make_batch_jit = jax.jit(_make_batch, static_argnames="config")
 
 
 def pair_batches(
@@ -61,7 +60,7 @@ def _given_batch(key, numbers, source, target, transform, *, config: PairConfig)
     return jax.vmap(one)(numbers, source, target, transform)
 
 
-_given_batch_jit = jit(_given_batch, static_argnames="config")
+_given_batch_jit = jax.jit(_given_batch, static_argnames="config")
 
 
 def given_pair_batches(

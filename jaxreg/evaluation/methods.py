@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg._xla import jit
 from jaxreg.batching import map_pairs
 from jaxreg.config import Config, ModelConfig
 from jaxreg.evaluation import baselines
@@ -140,7 +139,7 @@ def _register_batch(
     return map_pairs(one)(pair.source, pair.reference)
 
 
-_register_batch_jit = jit(_register_batch, static_argnames=("config", "padded"))
+_register_batch_jit = jax.jit(_register_batch, static_argnames=("config", "padded"))
 
 
 def network_method(variables: Variables, config: ModelConfig) -> Batch:
@@ -158,7 +157,7 @@ def _network(variables: Variables, trained: Config, model: ModelConfig | None) -
     if model is not None:
         chosen = {name: getattr(model, name) for name in AFTER_TRAINING}
         config = dataclasses.replace(config, **chosen)
-    one = jit(lambda x, y: iterate(variables, x, y, config=config)[0])
+    one = jax.jit(lambda x, y: iterate(variables, x, y, config=config)[0])
     return Method(network_method(variables, config), _of_clouds(one))
 
 
@@ -202,8 +201,8 @@ def _registered(source: np.ndarray, reference: np.ndarray) -> Outcome:
 
 def _traced(one: Callable[[PointCloud, PointCloud], RigidTransform]) -> Method:
     """Both forms of a pure function of two clouds with masks."""
-    many = jit(map_pairs(one))
-    return Method(lambda pair: many(pair.source, pair.reference), _of_clouds(jit(one)))
+    many = jax.jit(map_pairs(one))
+    return Method(lambda pair: many(pair.source, pair.reference), _of_clouds(jax.jit(one)))
 
 
 def _of_clouds(one: Callable) -> Callable[[np.ndarray, np.ndarray], Outcome]:
@@ -234,7 +233,7 @@ def refinement(config: RefineConfig) -> BatchRefinement:
         refined = refine(source.points, reference.points, initial=initial, config=config, **masks)
         return refined.transform
 
-    refine_batch = jit(map_pairs(one))
+    refine_batch = jax.jit(map_pairs(one))
     return lambda pair, initial: refine_batch(pair.source, pair.reference, initial)
 
 

@@ -12,7 +12,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._xla import at_row_min, row_min, written_out
+from jaxreg._xla import at_row_min, row_min, unfused, written_out
 from jaxreg.geometry.numerics import safe_sqrt
 
 _FAR = 1e30
@@ -27,7 +27,7 @@ def squared_feature_distance(
     # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as they can be.
     center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))[None, :]
     a, b = source - center, reference - center
-    product = jnp.matmul(a, b.T, precision=Precision.HIGHEST)
+    product = unfused(jnp.matmul(a, b.T, precision=Precision.HIGHEST))
     return jnp.sum(a * a, axis=1)[:, None] - 2 * product + jnp.sum(b * b, axis=1)[None, :]
 
 

@@ -30,8 +30,3 @@ def test_every_row_finds_the_pose_of_exact_matches(row, seed):
     assert isinstance(pose, RigidTransform)
     np.testing.assert_allclose(pose.rotation, turn, atol=1e-6)
     np.testing.assert_allclose(pose.translation, shift, atol=1e-6)
-
-
-def test_rows_differ_in_what_they_say():
-    rows = list(ablation_learned.ROWS.values())
-    assert len(set(rows)) == len(rows)

@@ -52,6 +52,22 @@ def test_far_clouds_give_finite_evidence(clouds):
     assert verdict.probability(found) < 0.05
 
 
+def test_what_leaves_a_motion_free_is_never_trusted(clouds):
+    source, reference, spacing = clouds
+    right = verdict.evidence(IDENTITY, source, reference, 1.5 * spacing, rival=0.2)
+    assert verdict.probability(right._replace(constraint=1e-6)) == 0
+
+
+def test_more_overlap_a_smaller_gap_and_a_weaker_rival_raise_the_probability(clouds):
+    source, reference, spacing = clouds
+    right = verdict.evidence(IDENTITY, source, reference, 1.5 * spacing, rival=0.2)
+    base = right._replace(overlap=0.6, smaller=0.5, gap=1.5, facing=-0.2, rival=0.1)
+    better = {"overlap": 0.8, "smaller": 0.7, "gap": 1.0, "facing": -0.1, "rival": 0.3}
+    for change, value in better.items():
+        changed = verdict.probability(base._replace(**{change: value}))
+        assert 0 < verdict.probability(base) < changed < 1, change
+
+
 def test_constraint_is_small_for_a_plane_and_large_for_a_corner(seed):
     rng = np.random.default_rng(seed)
     plane = np.c_[rng.uniform(size=(300, 2)), np.zeros(300)]
