@@ -130,8 +130,8 @@ def break_ties(
 ) -> Float[Array, "s"]:
     """The scores, changed in a close call by how much better than in the best pose the planes agree.
 
-    Sides of an object that differ by a small part score alike. The term is of no use for pairs that
-    are no close call (more of them are lost than won). Poses that are not `allowed` take no part.
+    Sides of an object that differ by a small part score alike. Added to all scores and not only in
+    close calls, the term gains less. Poses that are not `allowed` take no part.
     """
     if allowed is None:
         allowed = jnp.ones(score.shape[0], bool)

@@ -45,13 +45,15 @@ def test_right_candidates_agree_fully_and_outweigh_wrong_ones(seed):
     np.testing.assert_allclose(first[:20, :20], 1 - np.eye(20), atol=1e-9)
     weights = np.asarray(spectral_weights(first))
     assert weights[:20].min() > 2 * weights[20:].max()
-    loop = np.array(
-        [
-            [first[i, k] * sum(first[i, l] * first[l, k] for l in range(40)) for k in (0, 30)]
-            for i in (1, 25)
-        ]
-    )  # noqa: E501
-    np.testing.assert_allclose(second_order(first, 26)[np.ix_([1, 25], [0, 30])], loop, atol=1e-9)
+
+
+def test_second_order_counts_the_third_candidates_that_both_agree_with(seed):
+    first = np.random.default_rng(seed).uniform(0, 1, (7, 7))
+    expected = [
+        [first[i, k] * sum(first[i, l] * first[l, k] for l in range(7)) for k in range(7)]
+        for i in range(4)
+    ]
+    np.testing.assert_allclose(second_order(jnp.asarray(first), 4), expected, rtol=1e-12)
 
 
 def test_spectral_weights_are_the_leading_eigenvector(seed):
