@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.evaluation.baselines import open3d
+from jaxreg.evaluation.baselines.library import library
 from jaxreg.evaluation.baselines.open3d import SPACING
 from jaxreg.geometry.clouds import check_points
 from jaxreg.types import RigidTransform
@@ -42,10 +43,4 @@ def require() -> Any:
       ValueError: it or Open3D is not installed.
     """
     open3d.require()
-    try:
-        import kiss_matcher
-    except ImportError as error:
-        raise ValueError(
-            f'this baseline needs KISS-Matcher ({error}): pip install "jaxreg[baselines]".'
-        ) from None
-    return kiss_matcher
+    return library("kiss_matcher", "KISS-Matcher")

@@ -29,6 +29,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.evaluation.baselines.library import library
 from jaxreg.geometry.clouds import check_points
 from jaxreg.types import RigidTransform
 
@@ -98,12 +99,7 @@ def require() -> Any:
     Raises:
       ValueError: it is not installed.
     """
-    try:
-        import open3d
-    except ImportError as error:
-        raise ValueError(
-            f'this baseline needs Open3D ({error}): pip install "jaxreg[baselines]".'
-        ) from None
+    open3d = library("open3d", "Open3D")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 

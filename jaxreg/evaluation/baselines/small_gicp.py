@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.evaluation.baselines.library import library
 from jaxreg.evaluation.baselines.open3d import SPACING
 from jaxreg.geometry.clouds import check_points
 from jaxreg.types import RigidTransform
@@ -55,10 +56,4 @@ def require() -> Any:
     Raises:
       ValueError: it is not installed.
     """
-    try:
-        import small_gicp
-    except ImportError as error:
-        raise ValueError(
-            f'this baseline needs small_gicp ({error}): pip install "jaxreg[baselines]".'
-        ) from None
-    return small_gicp
+    return library("small_gicp", "small_gicp")
