@@ -71,10 +71,11 @@ def from_features(
     `coarse` is fast global registration (Zhou, Park and Koltun, 2016) or RANSAC over triplets of
     matches; `refinement` "icp" is the tutorial, with features of voxels.
     """
-    whole = features = _clouds(source, reference, spacing)
+    whole = described = _clouds(source, reference, spacing)
     if refinement == "icp" and _are_dense(*whole, spacing):
-        features = [_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole]
-    pose = _coarse(*features, coarse, spacing=spacing, seed=seed)
+        one, other = (_oriented(cloud.voxel_down_sample(spacing), spacing) for cloud in whole)
+        described = (one, other)
+    pose = _coarse(*described, coarse, spacing=spacing, seed=seed)
     if refinement == "icp":
         pose = _to_plane(*whole, pose, spacing)
     if refinement == "gicp":
