@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 INSIDE = {
-    *("jaxreg/viewer.html", "jaxreg/py.typed", "jaxreg/configs/synthetic_cpu.toml"),
+    *("jaxreg/view/viewer.html", "jaxreg/py.typed", "jaxreg/configs/synthetic_cpu.toml"),
     *(f"jaxreg/weights/{path.name}" for path in ROOT.glob("jaxreg/weights/*.npz")),
     *(f"jaxreg/weights/{path.stem}.json" for path in ROOT.glob("jaxreg/weights/*.npz")),
     *(f"jaxreg/configs/{path.name}" for path in ROOT.glob("configs/*.toml")),
