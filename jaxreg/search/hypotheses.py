@@ -16,13 +16,13 @@ from jaxreg.search.surface import Surface
 from jaxreg.types import RigidTransform
 
 CONSENSUS_SIZE = 12
-"""Other candidates that a pose is computed from."""
+"""How many other candidates a pose is computed from."""
 SCREEN_WIDTH = 0.06
 """Width of the Gaussian overlap that poses are screened by, in units of the search."""
 
 
 class Separation(NamedTuple):
-    """When two poses differ.
+    """When two poses count as different.
 
     They turn by more than `angle` (radians) from each other, or take the origin to places more than
     `distance` apart (units of the search).
@@ -64,7 +64,7 @@ def screen(
     *,
     width: float = SCREEN_WIDTH,
 ) -> Float[Array, "s"]:
-    """Share of the source that a pose lays on the reference, in [0, 1]: cheap, and one way.
+    """Share of the source that a pose puts on the reference, in [0, 1]: cheap, in one direction.
 
     Mean of ``exp(-d^2 / (2 width^2)) (n . m)^2`` over the source points; `grid` is of the reference.
     """
@@ -88,7 +88,7 @@ def pick_distinct(
 ) -> Int[Array, "count"]:
     """The best pose, the best of those that differ from it, and so on.
 
-    The origin should be the centroid of the source. When no pose is left that differs from all those
+    The origin should be the centroid of the source. If no pose is left that differs from all those
     chosen, a second round begins; poses that are not `allowed` take part from the second round on.
     """
     flat = poses.rotation.reshape(-1, 9)

@@ -112,7 +112,7 @@ def test_a_share_that_leaves_nothing(share, tmp_path):
 
 def test_no_folder_is_known():
     with pytest.raises(
-        ValueError, match=r"no folder is known: give --data-root, set \$JAXREG_DATA"
+        ValueError, match=r"their folder is not known: give --data-root, set \$JAXREG_DATA"
     ):
         load_shapes(DataConfig(), "train", points=8)
 

@@ -121,7 +121,7 @@ def test_malformed_file(key, value, message, tmp_path):
     replace(folder / "ply_data_train1.h5", key, value)
     with pytest.raises(ValueError, match=message) as error:
         modelnet.load(tmp_path, "train")
-    assert "download" in str(error.value) or "is it a file of" in str(error.value)
+    assert "download" in str(error.value) or "is it a file from" in str(error.value)
 
 
 def test_labels_without_second_axis(tmp_path):
