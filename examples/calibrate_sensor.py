@@ -19,8 +19,7 @@ CONFIG = RefineConfig(iterations=20, kernel="none")
 
 
 def scan_room(points, rotation, position, rng):
-    """What the scanner measures of `points` (n, 3) from a pose: in its own frame, with ranges too
-    long."""
+    """What the scanner measures of `points` (n, 3) from a pose, in its own frame."""
     seen = (points - position) @ rotation
     ranges = np.linalg.norm(seen, axis=1, keepdims=True)
     return seen * (1 + (TRUE_OFFSET + rng.normal(0, 0.002, ranges.shape)) / ranges)

@@ -49,7 +49,7 @@ class Options:
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, from any program."""
     refine: str = ""
-    """Then refine the poses on the clouds: icp, point_to_plane or gicp."""
+    """Refine the resulting poses on the clouds: icp, point_to_plane or gicp."""
     pairs: int = 0
     """Evaluate only the first N pairs; 0 means all."""
     batch: int = 8
@@ -63,7 +63,7 @@ class Options:
     save_transforms: str = ""
     """Write the predicted transforms to this NPZ file."""
     data_root: str = ""
-    """Folder of the data sets (default: $JAXREG_DATA, then data/ next to the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
 
 
 def main(arguments: list[str] | None = None) -> int:

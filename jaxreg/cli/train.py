@@ -27,14 +27,14 @@ class Options:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     workdir: str = ""
-    """Directory of the run (default: runs/CONFIG); an existing run is resumed."""
+    """Directory of the run (runs/CONFIG if left out); an existing run is resumed."""
     release: str = ""
     """Write the best weights under this new name, with a card of how they were made."""
     release_to: str = ""
-    """Directory to write them to (default: the workdir); `jaxreg.load_pretrained` takes
+    """Directory to write them to (the workdir if left out); `jaxreg.load_pretrained` takes
     DIRECTORY/NAME, or just NAME if $JAXREG_WEIGHTS is that directory."""
     data_root: str = ""
-    """Folder of the data sets (default: $JAXREG_DATA, then data/ next to the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -49,7 +49,7 @@ def knn(
     n = points.shape[0]
     if not 1 <= k < n:
         raise ValueError(
-            f"k = {k}, but the cloud has only n = {n} points: "
+            f"k = {k} neighbours in a cloud of n = {n} points: "
             "choose 1 <= k < n, or give more points."
         )
     points = jax.lax.stop_gradient(without_padding(jnp.asarray(points), mask))

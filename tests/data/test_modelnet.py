@@ -113,7 +113,7 @@ def test_listed_file_is_missing(tmp_path):
         ("label", np.zeros((4, 2), np.uint8), r"'label' must be integer \(4, 1\)"),
         ("label", np.zeros((4, 1)), "'label' must be integer .* got float64"),
         ("label", np.array([[1], [2], [40], [3]], np.uint8), "'label' is 40 in row 2"),
-        ("data", np.zeros((4, 32, 3), np.float32), r"the train files hold shapes of \[32, 64\]"),
+        ("data", np.zeros((4, 32, 3), np.float32), r"the train files have shapes of \[32, 64\]"),
     ],
 )
 def test_malformed_file(key, value, message, tmp_path):

@@ -139,10 +139,10 @@ def test_pose_of_a_fragment(tmp_path):
     path = write_fragment(tmp_path, 3, np.zeros((1, 3)))
     np.testing.assert_array_equal(seven_scenes.read_pose(path), POSE)
     path.with_name("cloud_bin_3.info.txt").write_text("scene\n1 2 3\n")
-    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must hold one line"):
+    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must contain one line"):
         seven_scenes.read_pose(path)
     path.with_name("cloud_bin_3.info.txt").unlink()
-    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must hold one line"):
+    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must contain one line"):
         seven_scenes.read_pose(path)
 
 
