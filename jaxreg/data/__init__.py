@@ -120,7 +120,7 @@ def load_training(
 def dataset_label(config: DataConfig, root: str | Path | None) -> str:
     """Name of the test data in tables: `config.label`, else chosen from what is in `root`.
 
-    A stand-in is called one, so its results never pass for those of the published data.
+    A stand-in is labelled as one, so its results never pass for those of the published data.
 
     Raises:
       ValueError: the data is missing.

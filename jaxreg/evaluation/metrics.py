@@ -49,7 +49,7 @@ def pair_errors(predicted: RigidTransform, truth: RigidTransform) -> PairErrors:
 
     Raises:
       ValueError: the shapes differ or are not those of stacked transforms, there is no pair, or a
-        pair (the message names the first) is not finite or its rotation not a rotation.
+        pair (the message names the first) is not finite or its matrix is not a rotation.
     """
     predicted, truth = _checked(predicted, "predicted"), _checked(truth, "true")
     if len(predicted.rotation) != len(truth.rotation):
@@ -74,7 +74,7 @@ def summarize(errors: PairErrors) -> dict[str, int | float]:
       over the Euler angles and over the coordinates (the anisotropic metrics of DCP).
     * `mie_r_deg`, `mie_t`: mean angle and mean length (the isotropic metrics of RPMNet; the frame
       that the published MIE(t) rotates into, ``R_gt^T (t_pred - t_gt)``, changes no length).
-    * `mie_r_deg_float32_acos`: the published form of MIE(R), which says nothing below 0.02 degrees.
+    * `mie_r_deg_float32_acos`: the published form of MIE(R), meaningless below 0.02 degrees.
     * `recall_1deg`: share of pairs within 1 degree and 0.01; `recall_5deg`: 5 degrees and 0.1.
     * `worst_pair`, `worst_rre_deg`, `worst_rte`: the pair with the largest angle.
     """

@@ -124,7 +124,7 @@ def _rotation_jvp(primals, tangents):
     At the optimum A is symmetric. Differentiating that, with ``dR = Omega R`` and Omega skew, gives
     ``Omega A + A Omega = (R dH)^T - R dH``, and for symmetric A the left side is the skew matrix of
     ``(trace(A) I - A) w``. Its eigenvalues are the sums of two (signed) singular values. The pseudo-
-    inverse leaves out those that vanish; it has derivatives of its own, of every order.
+    inverse leaves out those that vanish; it is differentiable to every order.
     """
     (covariance,), (covariance_dot,) = primals, tangents
     rotation = _rotation(covariance)

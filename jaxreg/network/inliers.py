@@ -105,8 +105,8 @@ def select_inliers(
     n = confidence.shape[0]
     if not 1 <= n_inliers <= n:
         raise ValueError(
-            f"N_c = {n_inliers} inliers, but the cloud has only n = {n} points: "
-            "set model.n_inliers to at most n."
+            f"N_c = {n_inliers} inliers of a cloud of n = {n} points: "
+            "choose 1 <= model.n_inliers <= n."
         )
     if mask is not None:
         confidence = jnp.where(mask, confidence, -1)

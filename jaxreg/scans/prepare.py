@@ -263,7 +263,7 @@ def _distinct(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _lexicographic(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The order of the rows by x, then y, then z, and whether any two have one x.
+    """The order of the rows by x, then y, then z, and whether any two share an x.
 
     Coordinates of scans rarely repeat, so one sort by x leaves little to do: a third of the time of
     a lexsort (and numpy.unique on rows takes several times as long).

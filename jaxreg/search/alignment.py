@@ -1,6 +1,6 @@
 """Refinement of poses inside the search: coarse with a grid, fine with exact neighbours.
 
-Both weigh a pair by a Gaussian of its *distance*, whose width narrows over the iterations, so
+Both weight a pair by a Gaussian of its *distance*, whose width narrows over the iterations, so
 points without a counterpart stop pulling although no overlap was ever estimated.
 """
 

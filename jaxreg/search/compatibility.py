@@ -1,8 +1,8 @@
 """Which candidates fit together: second-order spatial compatibility (SC2-PCR), with normals.
 
-A rigid motion keeps the distance of two points, the angle of their normals and the angle between a
-normal and the line that joins them. Two right candidates agree in all of these, and share more
-third candidates than two wrong ones do: ``C (C C)`` counts them (Chen et al., CVPR 2022).
+A rigid motion keeps the distance between two points, the angle between their normals, and the angle
+between a normal and the line that joins them. Two right candidates agree in all of these, and share
+more third candidates than two wrong ones do: ``C (C C)`` counts them (Chen et al., CVPR 2022).
 """
 
 import jax.numpy as jnp

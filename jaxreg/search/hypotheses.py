@@ -45,7 +45,7 @@ def pose_hypotheses(
     It is that of the candidate and of the `consensus_size` others that agree with it best, ranked by
     second-order compatibility; the weights of the Procrustes solution are the leading eigenvector of
     the compatibility among them. The seeds are the clearest candidates, not those that agree with
-    most others: where nine of ten are wrong, that loses the right ones.
+    most others: when nine in ten are wrong, that loses the right ones.
     """
     among = second_order(first, seeds)
     _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, consensus_size))

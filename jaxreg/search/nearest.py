@@ -12,7 +12,7 @@ from jaxreg.geometry.neighbors import squared_distances
 CELLS = 24
 """Cells of a grid along each axis: a cell of a usual shape is about a tenth of its radius."""
 _FAR = 1e4
-"""Where padding is put, in units of the clouds."""
+"""Coordinate at which padding is placed, in units of the clouds."""
 
 
 class NearestGrid(NamedTuple):

@@ -136,7 +136,8 @@ def _curves(columns: dict[str, np.ndarray]) -> Figure:
     for name, values in columns.items():
         width = 2 if name == "loss" else 1
         left.plot(*_binned(steps, values), marker=marker, label=name.replace("_", " "), lw=width)
-    # A mean surprise below zero (the entries of G can exceed 1) has no place on a logarithmic axis.
+    # A mean surprise below zero (the entries of G can exceed 1) cannot be shown on a logarithmic
+    # axis.
     left.set(title="training loss and its terms", xlabel="step")
     left.set_yscale("symlog", linthresh=1e-2)
     for name, label in _VALIDATION.items():

@@ -135,7 +135,7 @@ def blob(rng: Generator) -> Triangles:
 
 
 def composite(rng: Generator) -> Triangles:
-    """Four to eight primitives, anywhere and anyhow."""
+    """Four to eight primitives in random poses."""
     parts = []
     for _ in range(rng.integers(4, 9)):
         size = rng.uniform(0.2, 0.9, 3)
