@@ -149,7 +149,7 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Optimisation."""
+    """The optimiser, its schedule and validation."""
 
     steps: int = 6000
     """Optimiser steps."""
