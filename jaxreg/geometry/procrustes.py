@@ -60,9 +60,9 @@ def robust_procrustes(
     """`weighted_procrustes`, then `rounds` more times with less weight on pairs that do not fit.
 
     Each round multiplies the given weights by Geman and McClure's ``(s^2 / (s^2 + r_i^2))^2`` of the
-    residuals ``r_i = |R x_i + t - y_i|`` that the round before left. ``s`` is three times their median,
-    so it needs no tuning. On a thin shape a single wrong pair among hundreds would turn the others
-    about its axis; here it loses its pull. With no rounds this is Eq. 13.
+    residuals ``r_i = |R x_i + t - y_i|`` of the previous solution. ``s`` is three times their
+    median, so it needs no tuning. On a thin shape a single wrong pair among hundreds would turn the
+    others about its axis; here it loses its pull. With no rounds this is Eq. 13.
 
     Raises:
       ValueError: as `weighted_procrustes`.

@@ -35,7 +35,7 @@ def gicp(
     ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is `config.epsilon`:
     for two parallel planes with this epsilon, a residual across them then counts with its length.
     Covariances that are not given are those of planes: 1 along, ``e`` across, from `config.k`
-    neighbours; with `config.edges`, of surfaces that end (`edge_normals`). The kernel weighs
+    neighbours; with `config.edges`, of surfaces that end (`edge_normals`). The kernel applies to
     ``sqrt(r^T M r)``. With `config.correspondences_per_point` above 1, a point is also paired with
     neighbours of its nearest point, which averages out the noise of their planes. Everything else
     is as for `icp`.

@@ -27,9 +27,10 @@ def point_to_plane(
     """The pose after a fixed number of Gauss-Newton steps on ``sum_i w_i (n_i . r_i)^2``.
 
     ``r_i = R x_i + t - y_i``, where ``y_i`` is the reference point nearest to the moved ``x_i`` and
-    ``n_i`` its unit normal, of `config.k` neighbours unless `reference_normals` are given (zero
-    where there is none). The kernel weighs the distances to the planes; everything else is as for
-    `icp`. A motion that no plane opposes (a cloud that slides along a plane) does not change the pose.
+    ``n_i`` its unit normal, of `config.k` neighbours unless `reference_normals` are given (zeros
+    where there is none). The kernel applies to the distances to the planes; everything else is as
+    for `icp`. A motion that no plane opposes (a cloud that slides along a plane) does not change
+    the pose.
 
     Raises:
       ValueError: a shape or an option is wrong, or the reference has only `config.k` points or fewer.

@@ -86,9 +86,9 @@ def pose_uncertainty(
 ) -> PoseUncertainty:
     """Information and covariance of a pose, from nearest pairs; options as for `point_to_plane`.
 
-    The covariance assumes independent errors of the distances. It is a lower bound, because
-    neighbouring points share errors. Without any pair, `weight` and everything but `centre` and
-    `length` are zero.
+    The covariance assumes that the errors of the distances are independent. It is a lower bound,
+    because neighbouring points share errors. Without any pair, `weight` and everything but `centre`
+    and `length` are zero.
 
     Raises:
       ValueError: a shape or an option is wrong, or the reference has only `config.k` points or fewer.

@@ -134,7 +134,7 @@ def prepare(
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
     `cloud` is array-like (n, 3). `normals` (n, 3), of any length and sign, replace the computed
-    ones; give zero if unknown. `config` must be that of the registration, and `name` is how
+    ones; give zeros where unknown. `config` must be that of the registration, and `name` is how
     messages refer to the cloud.
 
     Raises:
