@@ -125,8 +125,14 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
             "nowhere/out.json: the folder nowhere does not exist: make it first",
         ),
         ("--json c.toml", "c.toml is already read or written by this command"),
-        ("--transforms x.npz --save-pairs x.npz", "x.npz is read or written by this command"),
-        ("--save-pairs x.npz --save-transforms x.npz", "x.npz is read or written by this command"),
+        (
+            "--transforms x.npz --save-pairs x.npz",
+            "x.npz is already read or written by this command",
+        ),
+        (
+            "--save-pairs x.npz --save-transforms x.npz",
+            "x.npz is already read or written by this command",
+        ),
     ],
 )
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(

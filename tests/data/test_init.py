@@ -201,5 +201,5 @@ def test_a_named_root_that_does_not_exist(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="--data-root is .*none, which is not a folder"):
         find_root(tmp_path / "none")
     monkeypatch.setenv("JAXREG_DATA", str(tmp_path / "none"))
-    with pytest.raises(ValueError, match=r"\$JAXREG_DATA names .*none"):
+    with pytest.raises(ValueError, match=r"\$JAXREG_DATA is .*none"):
         find_root()
