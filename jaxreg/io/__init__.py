@@ -1,4 +1,4 @@
-"""Clouds from and to files: one function each way, the format chosen by the suffix."""
+"""Read and write clouds: one function each; the suffix chooses the format."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -51,15 +51,15 @@ READABLE, WRITABLE = tuple(_READERS), tuple(_WRITERS)
 
 
 def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
-    """The points of a file, float64, in its own unit and order; meshes are sampled by area.
+    """Read a point cloud: (n, 3) float64, in the file's unit and order. The suffix chooses the format.
 
-    Points that are NaN stay in place: they are for the caller to refuse or to drop. Nothing is ever
-    unpickled.
+    Meshes are sampled by area. Points that are NaN stay in place: the caller refuses or drops them.
+    Nothing is ever unpickled.
 
     Raises:
       ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
-        truncated, its header names columns without x, y, z, or it holds no point; the message
-        names the file, the row where there is one, and the remedy.
+        truncated, its header names columns without x, y, z, or it contains no point; the message
+        names the file, the row if there is one, and the remedy.
       ImportError: a LAS or LAZ file, and laspy is not installed.
     """
     path = Path(path)
@@ -67,16 +67,16 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
         raise ValueError(f"{path} is a directory, not a file: name a file in it.")
     if path.suffix.lower() not in _READERS:
         raise ValueError(
-            f"{path}: the suffix '{path.suffix}' is no format known here: convert the file to one "
+            f"{path}: unknown format '{path.suffix}': convert the file to one "
             f"of {', '.join(READABLE)}."
         )
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file: correct the path.")
+        raise ValueError(f"{path}: no such file; check the path.")
     if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty (0 bytes): write it again.")
+        raise ValueError(f"{path} is empty (0 bytes): export it again.")
     points = _READERS[path.suffix.lower()](path)
     if len(points) == 0:
-        raise ValueError(f"{path} holds no point: write it again, or choose another file.")
+        raise ValueError(f"{path} contains no points: export it again, or choose another file.")
     return points
 
 
@@ -95,7 +95,7 @@ def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raises what `write_cloud` would that is known before: suffix, folder, and laspy for LAS."""
+    """Raise what `write_cloud` would raise before it writes: for suffix, folder, and laspy for LAS."""
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(
             f"{path}: clouds cannot be written as '{path.suffix}': choose one of "

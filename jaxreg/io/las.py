@@ -1,4 +1,4 @@
-"""LAS and LAZ, the files of airborne and terrestrial laser scanners, by laspy (extra `las`)."""
+"""LAS and LAZ, the formats of airborne and terrestrial laser scanners, with laspy (extra `las`)."""
 
 from pathlib import Path
 
@@ -8,11 +8,11 @@ from jaxreg._extras import extra
 
 
 def read(path: Path) -> np.ndarray:
-    """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
+    """The points (n, 3), float64, scaled and offset. Raises what `jaxreg.io.read_cloud` raises."""
     laspy = _laspy(path)
     try:
         with laspy.open(path) as file:
-            # A scan takes two bytes a point or more; a damaged count would be unpacked for minutes.
+            # A scan takes at least two bytes per point; a damaged count would be unpacked for minutes.
             if file.header.point_count > path.stat().st_size:
                 raise ValueError(f"it announces {file.header.point_count} points")
             return np.asarray(file.read().xyz, np.float64)
@@ -26,7 +26,7 @@ def read(path: Path) -> np.ndarray:
 def write(path: Path, points: np.ndarray) -> None:
     """Point format 0, steps of a 10^9th of the extent (the format stores integers).
 
-    Rows that are not finite are left out: integers have no NaN. The file then holds fewer points.
+    Rows that are not finite are left out, because integers have no NaN. The file then has fewer points.
 
     Raises:
       ImportError: laspy is missing.
@@ -36,16 +36,16 @@ def write(path: Path, points: np.ndarray) -> None:
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise ValueError(
-            f"{path}: no point is finite, and LAS stores no others: check the cloud, or choose "
+            f"{path}: no point is finite, and LAS stores only finite ones: check the cloud, or choose "
             "another format."
         )
     _store(laspy.LasData(laspy.LasHeader(point_format=0, version="1.2")), points, path)
 
 
 def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
-    """The file `original` with its points turned and moved; errors as `read`.
+    """The file `original` with its points turned and moved; raises what `read` raises.
 
-    Intensity, colours, times and whatever else it stores for a point stay.
+    Intensity, colours, times and everything else that it stores for a point stay.
     """
     laspy = _laspy(path)
     cloud = laspy.read(original)
@@ -54,7 +54,7 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
 
 def _store(cloud, points: np.ndarray, path: Path) -> None:
     offsets, scales = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-9) * 1e-9
-    # The header is written, but the coordinates are turned to integers by what the record holds.
+    # The header is written, but the record's own scales turn the coordinates into integers.
     for holder in (cloud.header, cloud.points):
         holder.offsets, holder.scales = offsets, scales
     cloud.xyz = points
@@ -62,7 +62,7 @@ def _store(cloud, points: np.ndarray, path: Path) -> None:
 
 
 def check_installed(path: Path) -> None:
-    """Raises ImportError where the file `path` could not be read or written for want of laspy."""
+    """Raise ImportError if `path` cannot be read or written because laspy is missing."""
     _laspy(path)
 
 

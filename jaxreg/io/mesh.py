@@ -1,4 +1,4 @@
-"""Meshes (OBJ, OFF, STL) as clouds: points spread evenly over the surface, by trimesh."""
+"""Meshes (OBJ, OFF, STL) as clouds: points spread evenly over the surface, with trimesh."""
 
 import io
 import re
@@ -15,7 +15,7 @@ _GLUED = re.compile(rb"^\s*(C?OFF)[ \t]*(?=[\d-])")
 def read(path: Path) -> np.ndarray:
     """Points (n, 3) of the surface, uniform by area, the same in every run; float64.
 
-    Errors as `jaxreg.io.read_cloud`.
+    Raises what `jaxreg.io.read_cloud` raises.
     """
     import trimesh  # a second of start-up that other formats need not pay
 
@@ -38,7 +38,7 @@ def read(path: Path) -> np.ndarray:
         shape = shape.to_geometry()
     vertices = np.asarray(getattr(shape, "vertices", np.empty((0, 3))), np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"{path}: its vertices have no three coordinates: export it again.")
+        raise ValueError(f"{path}: its vertices do not have three coordinates: export it again.")
     faces = getattr(shape, "faces", ())
     if len(faces) == 0:
         return vertices

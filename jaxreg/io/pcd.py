@@ -8,7 +8,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read(path: Path) -> np.ndarray:
-    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`."""
+    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises."""
     content = path.read_bytes()
     header, body = _header(path, content)
     row = _row_type(path, header)
@@ -19,10 +19,10 @@ def read(path: Path) -> np.ndarray:
     if kind == "binary_compressed":
         return _columns(path, _decompressed(path, body), row, count)
     if kind != "binary":
-        raise ValueError(f"{path}: DATA '{kind}' is no PCD encoding: save it again as binary.")
+        raise ValueError(f"{path}: DATA '{kind}' is not a PCD encoding: save it again as binary.")
     if len(body) < count * row.itemsize:
         raise ValueError(
-            f"{path} is truncated: {count} points are announced, and row "
+            f"{path} is truncated: it announces {count} points, but row "
             f"{len(body) // row.itemsize} is incomplete: copy it again."
         )
     rows = np.frombuffer(body, row, count)
@@ -72,7 +72,7 @@ def _row_type(path: Path, header: dict[str, list[str]]) -> np.dtype:
         return np.dtype(fields)
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
-            f"{path}: FIELDS, SIZE, TYPE and COUNT of the PCD header do not fit ({error}): "
+            f"{path}: FIELDS, SIZE, TYPE and COUNT of the PCD header do not match ({error}): "
             "save it again."
         ) from None
 
@@ -90,8 +90,7 @@ def _ascii(path: Path, body: bytes, row: np.dtype, count: int) -> np.ndarray:
     lines = [line.split() for line in body.decode("latin-1").splitlines() if line.strip()]
     if len(lines) < count:
         raise ValueError(
-            f"{path} is truncated: {count} points are announced and {len(lines)} are there: "
-            "copy it again."
+            f"{path} is truncated: it announces {count} points and has {len(lines)}: copy it again."
         )
     points = np.empty((count, 3))
     for i, words in enumerate(lines[:count]):
@@ -99,7 +98,7 @@ def _ascii(path: Path, body: bytes, row: np.dtype, count: int) -> np.ndarray:
             points[i] = [float(words[column]) for column in columns]
         except (IndexError, ValueError):
             raise ValueError(
-                f"{path}, point {i}: '{' '.join(words)[:60]}' is no point: mend or remove the line."
+                f"{path}, point {i}: '{' '.join(words)[:60]}' is not a point: fix or remove the line."
             ) from None
     return points
 
@@ -115,7 +114,7 @@ def _decompressed(path: Path, body: bytes) -> bytes:
 
 
 def _lzf(packed: bytes) -> bytes:
-    """LZF: runs of literals, and references backwards into what has been unpacked."""
+    """LZF: runs of literals, and back references into what has been unpacked."""
     result, i = bytearray(), 0
     try:
         while i < len(packed):
@@ -131,7 +130,7 @@ def _lzf(packed: bytes) -> bytes:
                 i += 1
             start = len(result) - ((control & 31) << 8) - packed[i] - 1
             i += 1
-            for offset in range(start, start + length + 2):  # may run into what it appends
+            for offset in range(start, start + length + 2):  # may overlap with what it appends
                 result.append(result[offset])
     except IndexError:
         return b""
@@ -141,7 +140,9 @@ def _lzf(packed: bytes) -> bytes:
 def _columns(path: Path, content: bytes, row: np.dtype, count: int) -> np.ndarray:
     """Compressed files store one field after the other."""
     if len(content) < count * row.itemsize:
-        raise ValueError(f"{path}: the compressed data hold fewer than {count} points: save again.")
+        raise ValueError(
+            f"{path}: the compressed data has fewer than {count} points: save it again."
+        )
     columns, position = {}, 0
     for name in _names(row):
         columns[name] = np.frombuffer(

@@ -1,4 +1,4 @@
-"""PLY: ascii and binary of both byte orders, with any other properties and elements, by plyfile."""
+"""PLY: ascii and binary of both byte orders, with any other properties and elements, with plyfile."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 
 def read(path: Path) -> np.ndarray:
-    """The vertices (n, 3), float64. Errors as `jaxreg.io.read_cloud`."""
+    """The vertices (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises."""
     try:
         vertex = _open(path)["vertex"]
         return np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     except KeyError:
         raise ValueError(
-            f"{path} has no element 'vertex': it is not a point cloud; export it again."
+            f"{path} has no element 'vertex', so it is not a point cloud: export it again."
         ) from None
     except ValueError as error:
         missing = "no field" in str(error)
@@ -23,7 +23,7 @@ def read(path: Path) -> np.ndarray:
 
 def _open(path: Path) -> PlyData:
     try:
-        # Mapped, since plyfile reads row by row otherwise: 0.3 s for 50,000 points instead of 0.01.
+        # Mapped, because plyfile otherwise reads row by row: 0.3 s for 50,000 points instead of 0.01.
         data = PlyData.read(str(path), mmap="c")
     except PlyParseError as error:
         # plyfile says which element and row, or which line of the header.
@@ -31,7 +31,7 @@ def _open(path: Path) -> PlyData:
     except UnicodeDecodeError:
         raise ValueError("the header is not ascii text") from None
     for element in data.elements:
-        # A copy, so that the file can be written again under its own name.
+        # A copy, so the file can be written again under its own name.
         element.data = np.array(element.data)
     return data
 
@@ -47,7 +47,7 @@ def write(path: Path, points: np.ndarray) -> None:
 def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
     """Write a PLY file again with its vertices (and normals) moved and everything else kept.
 
-    x, y, z become double, so that large offsets lose nothing.
+    x, y, z become double, so large offsets lose nothing.
     """
     data = _open(original)
     elements = []

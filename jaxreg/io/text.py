@@ -1,4 +1,4 @@
-"""Text with a point a line: XYZ, TXT, CSV; separated by blanks, tabs, commas or semicolons."""
+"""Text with one point per line: XYZ, TXT, CSV; separated by spaces, tabs, commas or semicolons."""
 
 import io
 import re
@@ -11,23 +11,23 @@ _MARK = re.compile(r"^\s*[#/]+")
 _LABEL = re.compile(r"^\s*\w+:\s")
 """As in "# columns: x y z"."""
 _UNIT = re.compile(r"\s+(?=[\[(][^\W\d]+[\])])")
-"""The blank in "X [m]", which parts no columns."""
+"""The space in "X [m]", which does not separate columns."""
 _AXIS = re.compile(r"([xyz])(\s*[\[(].*[\])]|[\s_/](m|mm|cm|km|ft|in))?", re.IGNORECASE)
 
 
 def read(path: Path) -> np.ndarray:
-    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`.
+    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
 
-    Columns x, y, z where a header names them, also in a comment above the points and with units
-    ("X [m]"); without a header the first three; other columns are not read. A header that has a
-    name for every column, and none of x, y, z, is an error. Other comments are skipped, and so is a
-    first line with nothing but the number of points.
+    Columns x, y, z if a header names them, also in a comment above the points and with units ("X
+    [m]"); without a header the first three. Other columns are ignored. A header that has a name for
+    every column, and none of x, y, z, is an error. Other comments are skipped, and so is a first
+    line with nothing but the number of points.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise ValueError(
-            f"{path} is no text file: give it the suffix of its format, or export it as text."
+            f"{path} is not a text file: give it the suffix of its format, or export it as text."
         ) from None
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if _is_data(line)]
     if not numbered:
@@ -51,7 +51,7 @@ def read(path: Path) -> np.ndarray:
 
 
 def write(path: Path, points: np.ndarray) -> None:
-    """A point a line, 12 digits; a CSV file gets the header x,y,z."""
+    """One point per line, 12 digits; a CSV file gets the header x,y,z."""
     csv = path.suffix.lower() == ".csv"
     header, delimiter = ("x,y,z", ",") if csv else ("", " ")
     np.savetxt(path, points, fmt="%.12g", delimiter=delimiter, header=header, comments="")
@@ -63,7 +63,7 @@ def _is_data(line: str) -> bool:
 
 
 def _separator(line: str) -> str | None:
-    """The one that the line holds; None is any run of blanks and tabs."""
+    """The separator in the line; None is any run of spaces and tabs."""
     return next((mark for mark in (";", ",") if mark in line), None)
 
 
@@ -80,7 +80,7 @@ def _is_number(field: str) -> bool:
 
 
 def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple[int, ...]:
-    """Where x, y, z stand among `width` columns, by the lines above the points, last line first.
+    """Which of `width` columns are x, y, z, from the lines above the points, last line first.
 
     Raises:
       ValueError: a header names columns, but not x, y, z, or more than there are; or it is a line of
@@ -96,12 +96,12 @@ def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple
         names = _split(_joined(line, separator), separator)
         if _is_data(line) and len(names) < 3:
             raise ValueError(
-                f"{path}, line {number}: '{' '.join(names)}' is no point: give x y z in a line."
+                f"{path}, line {number}: '{' '.join(names)}' is not a point: write x y z on each line."
             )
         if _is_data(line) and len(names) > width and set("xyz") <= set(map(_axis, names)):
             raise ValueError(
-                f"{path}, line {number}: the header has {len(names)} names for {width} columns: part "
-                "them by what parts the columns, with no blank inside a name."
+                f"{path}, line {number}: the header has {len(names)} names for {width} columns: "
+                "separate them as the columns are separated, with no spaces inside a name."
             )
         # A comment is a header only on the first line, and not if it is a remark like "by: me".
         titled = number == head[0][0] and all(_is_name(name) for name in names)
@@ -109,7 +109,7 @@ def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple
         if len(names) == width >= 3 and (_is_data(line) or titled):
             raise ValueError(
                 f"{path}, line {number}: the header names the columns {', '.join(names)[:80]}, "
-                "and not x, y, z: name the columns x, y, z, or remove the header."
+                "not x, y, z: name the columns x, y, z, or remove the header."
             )
     return (0, 1, 2)
 
@@ -117,7 +117,7 @@ def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple
 def _namings(line: str, separator: str | None) -> list[list[str]]:
     """The names in a line: split as the points are, or as the line itself suggests.
 
-    By tabs first, since blanks may then stand inside a name ("Point ID").
+    By tabs first, because a name may then contain spaces ("Point ID").
     """
     text = _LABEL.sub("", _joined(line, separator))
     own = _separator(text)
@@ -126,7 +126,7 @@ def _namings(line: str, separator: str | None) -> list[list[str]]:
 
 
 def _joined(line: str, separator: str | None) -> str:
-    """A line without its comment mark, and with units joined to names if blanks part columns."""
+    """A line without its comment mark, and with units joined to names if spaces separate columns."""
     text = line if _is_data(line) else _MARK.sub("", line)
     return text if separator else _UNIT.sub("", text)
 
@@ -145,10 +145,12 @@ def _fault(path: Path, numbered: list, separator: str | None, columns: tuple[int
         fields = _split(line, separator)
         if len(fields) <= max(columns):
             return (
-                f"{path}, line {number}: '{line.strip()[:60]}' has {len(fields)} column(s), and a "
+                f"{path}, line {number}: '{line.strip()[:60]}' has {len(fields)} column(s), but a "
                 "point needs 3: complete or remove the line."
             )
         bad = [fields[c] for c in columns if not _is_number(fields[c])]
         if bad:
-            return f"{path}, line {number}: '{bad[0][:40]}' is no number: mend or remove the line."
-    return f"{path} cannot be read as text with a point a line: export it again."
+            return (
+                f"{path}, line {number}: '{bad[0][:40]}' is not a number: fix or remove the line."
+            )
+    return f"{path} cannot be read as text with one point per line: export it again."

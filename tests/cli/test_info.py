@@ -27,4 +27,4 @@ def test_clouds_without_a_finite_point(tmp_path, run):
     io.write_cloud(tmp_path / "nan.npy", np.full((4, 3), np.nan))
     for command in ("info", "view"):
         status, _, err = run(command, tmp_path / "nan.npy")
-        assert (status, "no point is finite" in err) == (BAD_INPUT, True)
+        assert (status, "contains no finite point" in err) == (BAD_INPUT, True)

@@ -125,7 +125,7 @@ def test_no_output_replaces_an_input(folder, tmp_path, run, option):
     for path in paths:
         status, out, err = run("register", paths[0], folder / "b.pcd", option, path)
         assert (status, out) == (BAD_INPUT, "")
-        assert f"{path} is read or written by this command already" in err
+        assert f"{path} is already read or written by this command" in err
     assert paths[0].read_bytes() == before
     twice = ("--json", tmp_path / "r.html", "--html", tmp_path / "r.html")
     status, _, err = run("register", paths[0], folder / "b.pcd", *twice)
@@ -158,12 +158,12 @@ MISTAKES = {
     "no such file": ["absent.ply", "good.csv"],
     "0 bytes": ["empty.ply", "good.csv"],
     "needs at least 3": ["good.csv", "two.xyz"],
-    "suffix '.docx'": ["good.csv", "scan.docx"],
+    "unknown format '.docx'": ["good.csv", "scan.docx"],
     "cannot be written as '.obj'": ["good.csv", "good.csv", "-o", "out.obj"],
     "nowhere does not exist": ["good.csv", "good.csv", "--html", "nowhere/r.html"],
     "written as .png, .pdf or .svg": ["good.csv", "good.csv", "--plot", "r.bmp"],
-    "holds no 4x4 matrix": ["good.csv", "good.csv", "--initial", "two.xyz"],
-    "absent.txt: there is no such file": ["good.csv", "good.csv", "--initial", "absent.txt"],
+    "does not contain a 4x4 matrix": ["good.csv", "good.csv", "--initial", "two.xyz"],
+    "absent.txt: no such file": ["good.csv", "good.csv", "--initial", "absent.txt"],
     "not a rigid transform": ["good.csv", "good.csv", "--initial", "scale.npy"],
     "may be transposed": ["good.csv", "good.csv", "--initial", "transposed.npy"],
     "config.search_points must be at least 16": [
