@@ -139,10 +139,11 @@ def rotation_angle_deg(
     return np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
 
 
-def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def nearest_rotation(matrix: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k 3 3"]:
     """The rotation nearest to a matrix, orthogonal to float64 (numpy, on the host)."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
 
 
 def _leading_axes(transform: RigidTransform) -> tuple[int, ...]:

@@ -12,6 +12,8 @@ class RegisterConfig:
 
     search: SearchConfig = SearchConfig()
     """The search for a pose, used if no start is given."""
+    wide: SearchConfig | None = SearchConfig(candidates=1024, seeds=1024, screened=512, aligned=32)
+    """A second search, with learned features, if the first leaves doubts; None: there is none."""
     refine: RefineConfig | None = RefineConfig(
         iterations=10,
         kernel_annealing=8.0,

@@ -11,34 +11,37 @@ from jaxtyping import Float
 
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_pose, padded_size
-from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
+from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.judge.evidence import Evidence
+from jaxreg.judge.odds import probabilities
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import prepare, verdict
+from jaxreg.scans import candidates, prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
+from jaxreg.search.config import SearchConfig
 from jaxreg.search.learned import load_features
 from jaxreg.search.stages import search_described
 from jaxreg.types import RigidTransform
 
 _SMALLEST = 512
 """Smallest size of a padded cloud in the search."""
-_TURN_COST = 0.01
-"""What half a turn costs in the choice of a pose, in units of the search's score: among poses that
-agree equally (a symmetric shape) the one that turns least is chosen."""
-_RIVAL_DEG, _RIVAL_DISTANCE = 15.0, 0.2
-"""A pose that turns by more than this from the chosen one, or moves the source's centroid farther
-away (in the unit of the frame), is another pose and not a variant of it."""
+_TURN_COST = 0.2
+"""Log odds that half a turn costs in the choice of a pose: of poses that agree equally well (a
+symmetric shape) the one that turns least is taken."""
+_SURE = 0.9
+"""Probability at which the search ends, because an easy pair needs no wider one."""
+_FIRST, _WIDE = 4, 16
+"""Distinct poses that are refined and judged, after the first search and after the wider one."""
+_LISTED = 0.01
+"""Smallest probability at which a pose is listed among the alternatives."""
 
 
 class Alternative(NamedTuple):
-    """Another pose that the search found, and how much worse it agrees.
-
-    `lead` is in shares of the points; near 0 the two poses agree equally well.
-    """
+    """Another pose of the source, and the probability that it is the right one."""
 
     transform: RigidTransform
-    lead: float
+    probability: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,7 +58,8 @@ class ScanRegistration:
 
     `success` is False if the pose should not be trusted, and `reason` says why in one sentence;
     `probability` is the calibrated chance that the pose is right, and `evidence` is what it is
-    computed from. `alternatives` are the other poses that the search found, the best first.
+    computed from. `alternatives` are the other poses that may be right, the likeliest first; their
+    probabilities and `probability` add up to at most 1.
 
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
     reference's distinct points; NaN if nothing was refined or no surfaces were near each other.
@@ -79,7 +83,7 @@ class ScanRegistration:
     covariance: Float[np.ndarray, "6 6"]
     weak_directions: tuple[WeakDirection, ...]
     alternatives: tuple[Alternative, ...]
-    evidence: verdict.Evidence
+    evidence: Evidence
     converged: bool | None
     dropped: int
 
@@ -89,7 +93,7 @@ class ScanRegistration:
         return RigidTransform(self.rotation, self.translation)
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """Two prepared clouds in one frame; points within `distance` count as the same."""
 
     source: Prepared
@@ -100,19 +104,20 @@ class _Problem(NamedTuple):
     distance: float
     config: RegisterConfig
 
-    def placed(self) -> tuple[tuple[prepare.Level, float], tuple[prepare.Level, float]]:
-        """Both levels, each with its scale in the frame."""
-        source, reference = self.levels
-        length = float(self.where.length)
-        return (source, self.source.radius / length), (reference, self.reference.radius / length)
+    def clouds(self) -> candidates.Clouds:
+        """Both fine levels in the frame."""
+        sides = (self.source, self.reference)
+        source, reference = (side.in_frame(side.fine, self.where) for side in sides)
+        return candidates.Clouds(
+            source, reference, (sides[0].fine.examined, sides[1].fine.examined)
+        )
 
 
 class _Found(NamedTuple):
-    """A pose in the frame, how much better it is than the next distinct one, and the others."""
+    """The chosen pose in the frame, and the others with their log odds."""
 
     pose: RigidTransform
-    rival: float
-    alternatives: tuple[Alternative, ...]
+    others: tuple[tuple[RigidTransform, float], ...]
 
 
 def register(
@@ -140,7 +145,7 @@ def register(
     config = RegisterConfig() if config is None else config
     _check_options(max_rotation_deg, config)
     start = None if initial is None else check_pose(initial, "initial")
-    problem = _pose_problem(
+    problem = pose_problem(
         _prepared(source, "source", nonfinite, config),
         _prepared(reference, "reference", nonfinite, config),
         config,
@@ -148,13 +153,8 @@ def register(
     if start is None:
         found = _search(problem, max_rotation_deg)
     else:
-        found = _Found(frame.transform_in(problem.where, start), verdict.NOT_SEARCHED, ())
-    refined = _refine(problem, found.pose)
-    placed = problem.placed()
-    judged = verdict.evidence(
-        refined.transform, placed[0], placed[1], problem.distance, rival=found.rival
-    )
-    return _result(problem, refined, judged, found.alternatives)
+        found = _Found(frame.transform_in(problem.where, start), ())
+    return _result(problem, _refine(problem, found.pose), found)
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}
@@ -185,7 +185,8 @@ def _prepared(cloud: object, name: str, nonfinite, config: RegisterConfig) -> Pr
     return cloud
 
 
-def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) -> _Problem:
+def pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) -> Problem:
+    """Two prepared clouds in one frame."""
     length = math.hypot(source.radius, reference.radius) / math.sqrt(2)
     where = frame.Frame(source.centre, reference.centre, length)
     levels = prepare.at_one_density(source, reference)
@@ -194,39 +195,51 @@ def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig)
         prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides)
     )
     distance = config.inlier_spacings * spacing
-    return _Problem(source, reference, where, levels, spacing, distance, config)
+    return Problem(source, reference, where, levels, spacing, distance, config)
 
 
-def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
-    """The most plausible pose, and how much more plausible it is than the next distinct one."""
-    where, most = problem.where, math.radians(max_rotation_deg or 180.0)
-    poses, score, allowed = _searched_poses(problem, most)
-    turned = np.radians(rotation_angle_deg(poses.rotation, np.eye(3)[None]))
-    # If no pose is allowed, the best of the others is at least an answer.
+def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
+    """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
+    config, most = problem.config, math.radians(max_rotation_deg or 180.0)
+    found = searched_and_judged(problem, most, config.search)
+    if config.wide is not None and probabilities(found.score).max() < _SURE:
+        found = candidates.merged(found, searched_and_judged(problem, most, config.wide))
+    turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
+    # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
+    # the others is at least an answer.
+    allowed = turned <= most + 1e-3
     allowed = allowed if allowed.any() else np.ones_like(allowed)
-    best = int(np.argmax(np.where(allowed, score, -np.inf) - _TURN_COST * turned / np.pi))
-    apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
-    angle = rotation_angle_deg(poses.rotation, poses.rotation[best][None])
-    # A pose that turns too far is not a rival: it was ruled out.
-    others = allowed & ((angle > _RIVAL_DEG) | (apart > _RIVAL_DISTANCE))
-    rival = float(score[best] - score[others].max()) if others.any() else verdict.NO_RIVAL
-    alternatives = tuple(
-        Alternative(frame.transform_out(where, _nth(poses, i)), float(score[best] - score[i]))
-        for i in np.flatnonzero(others).tolist()
+    best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
+    poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
+    others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
+    return _Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
+
+
+def searched_and_judged(problem: Problem, most: float, search: SearchConfig) -> candidates.Judged:
+    """The distinct poses of one search, refined and judged; they turn by at most `most` radians."""
+    first = search == problem.config.search
+    poses, score = _searched_poses(problem, most, search, problem.config.learned or not first)
+    spacing = max(
+        cloud.fine.spacing * cloud.radius for cloud in (problem.source, problem.reference)
     )
-    return _Found(_nth(poses, best), rival, alternatives)
+    distance = problem.config.refine_spacings * min(
+        problem.spacing, max(prepare.FINEST, spacing / float(problem.where.length))
+    )
+    return candidates.judged(
+        problem.clouds(), poses, score, distance=distance, most=_FIRST if first else _WIDE
+    )
 
 
 def _searched_poses(
-    problem: _Problem, most: float
-) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
-    """The poses of the search in the pair's frame (float64), their scores, and which are allowed."""
-    where, config = problem.where, problem.config
+    problem: Problem, most: float, search: SearchConfig, learned: bool
+) -> tuple[RigidTransform, np.ndarray]:
+    """The poses of the search in the pair's frame (float64), and their scores; the allowed ones."""
+    where = problem.where
     # Twice the radius: a usual shape then fills the unit sphere.
     unit = prepare.in_steps(2 * float(where.length))
     size = padded_size(max(len(level.points) for level in problem.levels), smallest=_SMALLEST)
     described = (
-        level.described(unit / cloud.radius, size, config.search)
+        level.described(unit / cloud.radius, size, search.radii)
         for level, cloud in zip(problem.levels, (problem.source, problem.reference), strict=True)
     )
     unmoved = frame.transform_in(
@@ -234,29 +247,29 @@ def _searched_poses(
     )
     # Clouds that lie farther apart than float32 reaches do not overlap as they are anyway.
     also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
-    found = _program(config)(*described, also, np.float32(most))
+    found = _program(search, learned)(*described, also, np.float32(most))
     poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
     scale = unit / float(where.length)
     poses = poses._replace(translation=poses.translation * scale)
-    return poses, np.asarray(found.score), np.asarray(found.allowed)
+    chosen = np.flatnonzero(found.allowed)
+    # If no pose is allowed, the best of the others is at least an answer.
+    chosen = chosen if len(chosen) else np.arange(len(found.allowed))
+    poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
+    return poses, np.asarray(found.score)[chosen]
 
 
 @functools.cache
-def _program(config: RegisterConfig):
+def _program(search: SearchConfig, learned: bool):
     def run(network, source, reference, also, max_angle):
         return search_described(
-            source, reference, network=network, also=also, max_angle=max_angle, config=config.search
+            source, reference, network=network, also=also, max_angle=max_angle, config=search
         )
 
-    network = jax.device_put(load_features()) if config.learned else None
+    network = jax.device_put(load_features()) if learned else None
     return functools.partial(jax.jit(run), network)
 
 
-def _nth(poses: RigidTransform, i: int) -> RigidTransform:
-    return RigidTransform(nearest_rotation(poses.rotation[i]), poses.translation[i])
-
-
-def _refine(problem: _Problem, pose: RigidTransform) -> Refined:
+def _refine(problem: Problem, pose: RigidTransform) -> Refined:
     """The pose refined with more points than the search had, or as it is."""
     config = problem.config
     if config.refine is None:
@@ -272,12 +285,7 @@ def _refine(problem: _Problem, pose: RigidTransform) -> Refined:
     return refine_indexed(*clouds, initial=pose, distance=distance, config=config.refine)
 
 
-def _result(
-    problem: _Problem,
-    refined: Refined,
-    judged: verdict.Evidence,
-    alternatives: tuple[Alternative, ...],
-) -> ScanRegistration:
+def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistration:
     source, where = problem.source, problem.where
     length = float(where.length)
     pose = frame.transform_out(where, refined.transform)
@@ -285,7 +293,17 @@ def _result(
     inside = near <= problem.distance
     confidence = np.maximum(0, 1 - (near / problem.distance) ** 2) ** 2
     correspondences = problem.reference.points[nearest] * problem.reference.radius
-    chance = verdict.probability(judged)
+    evidence, score = problem.clouds().judge(
+        jax.tree.map(lambda leaf: leaf[None], refined.transform)
+    )
+    judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
+    chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
+    chance = 0.0 if verdict.is_free(judged) else float(chances[0])
+    alternatives = tuple(
+        Alternative(frame.transform_out(where, other), float(likely))
+        for (other, _), likely in zip(found.others, chances[1:], strict=True)
+        if likely >= _LISTED
+    )
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(refined.uncertainty)
@@ -300,8 +318,10 @@ def _result(
         ),
         success=chance >= verdict.TRUSTED,
         probability=chance,
-        reason=verdict.reason(judged, weak) if chance < verdict.TRUSTED else "",
-        overlap=judged.overlap,
+        reason=""
+        if chance >= verdict.TRUSTED
+        else verdict.reason(judged, weak, float(chances[1:].sum())),
+        overlap=_overlap(problem, refined.transform),
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
         max_correspondence_distance=problem.distance * length,
@@ -314,12 +334,26 @@ def _result(
     )
 
 
-def _nearest(problem: _Problem, pose: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(problem: Problem, pose: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
     """For every source point: distance, in the frame, to the nearest reference point, and its index."""
     source, reference, length = problem.source, problem.reference, float(problem.where.length)
     moved = source.points @ (pose.rotation.T * (source.radius / length)) + pose.translation
     near, index = prepare.nearest(reference.tree, moved * (length / reference.radius))
     return near * (reference.radius / length), index
+
+
+def _overlap(problem: Problem, pose: RigidTransform) -> float:
+    """Share of the points of both clouds, at one density, within reach of the other."""
+    length = float(problem.where.length)
+    sides = zip(problem.levels, (problem.source, problem.reference), strict=True)
+    source, reference = (
+        level.index._replace(scale=cloud.radius / length) for level, cloud in sides
+    )
+    within = problem.distance
+    there = reference.nearest(source.moved_by(pose), within=within)[0]
+    back = source.nearest(reference.moved_back_by(pose), within=within)[0]
+    distances = np.concatenate([there, back])
+    return float(np.mean(distances < problem.distance))
 
 
 def _covariance(uncertainty: PoseUncertainty, length: float) -> Float[np.ndarray, "6 6"]:

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
+from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
@@ -43,7 +44,7 @@ class Level:
     points: Float[np.ndarray, "v 3"]
     normals: Float[np.ndarray, "v 3"] | None
     k: int
-    _described: dict[tuple[float, int, SearchConfig], Described] = dataclasses.field(
+    _described: dict[tuple[float, int, tuple[float, ...]], Described] = dataclasses.field(
         default_factory=dict
     )
 
@@ -58,21 +59,22 @@ class Level:
         return spacing(self.points, self.index.tree)
 
     @functools.cached_property
-    def own_agreement(self) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
-        """What `agreement` says of every point and its nearest neighbour in the same cloud."""
-        k = min(2, len(self.points))  # a cloud of one point is its own neighbour
-        nearest = self.index.tree.query(self.points, k=[k], workers=-1)[1][:, 0]
-        normals = self.index.host_normals
-        return agreement(self.points, self.points[nearest], normals, normals[nearest])
+    def examined(self) -> Examined:
+        """The level as the judge sees it, padded as the index is, in the unit of the level."""
+        mask = np.arange(len(self.index.padded)) < len(self.points)
+        return _examine(self.index.padded, self.index.normals, self.index.neighbors, mask)
 
-    def described(self, unit: float, size: int, config: SearchConfig) -> Described:
+    def described(self, unit: float, size: int, radii: tuple[float, ...]) -> Described:
         """The cloud as the search takes it, padded to `size` rows; `unit` is in units of the level."""
-        key = (unit, size, config)
+        key = (unit, size, radii)
         if key not in self._described:
             normals = None if self.normals is None else padded(self.normals, size)[0]
+            found = self.index.neighbors[: len(self.points)]
+            neighbors = np.repeat(np.arange(size, dtype=np.int32)[:, None], found.shape[1], axis=1)
+            neighbors[: len(found)] = found
             arrays = padded(self.points, size)
             scale = np.float32(np.clip(unit, 1e-30, 1e30))
-            self._described[key] = _describe(*arrays, scale, normals, config=config)
+            self._described[key] = _describe(*arrays, scale, normals, neighbors, radii=radii)
         return self._described[key]
 
 
@@ -177,14 +179,6 @@ def in_steps(value: float) -> float:
     return 2.0 ** (round(_STEPS * math.log2(value)) / _STEPS) if value > 0 else 0.0
 
 
-def agreement(
-    x: np.ndarray, y: np.ndarray, x_normals: np.ndarray, y_normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of points x from the planes of their partners y, and |cosines| of the normals."""
-    across = np.abs(np.sum((x - y) * y_normals, axis=1))
-    return across, np.abs(np.sum(x_normals * y_normals, axis=1))
-
-
 def voxel_reduced(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "v 3"]:
     """The mean of the points in every occupied cube of edge `size`, in lexicographic order."""
     return _means(points, _cubes(_from_corner(points), size))
@@ -236,9 +230,15 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
     return float(np.median(found.query(points, k=k + 1, workers=-1)[0][:, -1]))
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _describe(points, mask, unit, normals, *, config: SearchConfig) -> Described:
-    return describe(points, mask, unit=unit, normals=normals, config=config)
+_examine = jax.jit(examine)
+
+
+@functools.partial(jax.jit, static_argnames="radii")
+def _describe(points, mask, unit, normals, neighbors, *, radii: tuple[float, ...]) -> Described:
+    return describe(
+        points, mask, unit=unit, normals=normals, neighbors=neighbors,
+        config=SearchConfig(radii=radii),
+    )  # fmt: skip
 
 
 def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k: int) -> Level:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from jaxreg.scans.pair import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
-_CLOSE = 0.03
-"""Lead below which another pose is mentioned: that of a close call in the search."""
+_MENTIONED = 0.05
+"""Probability from which another pose is mentioned."""
 _UNKNOWN = "not known: nothing was refined, or no surfaces are within reach"
 
 
@@ -60,13 +60,14 @@ def record(result: ScanRegistration) -> dict[str, Any]:
 
 
 def _alternatives(result: ScanRegistration) -> str:
-    """How many other poses are nearly as good as the chosen one, and the best of them."""
-    close = [other for other in result.alternatives if other.lead < _CLOSE]
-    if not close:
-        return "none nearly as good"
-    turns = [axis_angle(other.transform.rotation @ result.rotation.T)[1] for other in close]
-    listed = ", ".join(f"turned by {math.degrees(turn):.0f} deg" for turn in turns)
-    return f"{len(close)} nearly as good ({listed} from this one)"
+    """The other poses that may be right, and how likely each is."""
+    listed = [
+        f"{other.probability:.2f} turned by "
+        f"{math.degrees(axis_angle(other.transform.rotation @ result.rotation.T)[1]):.0f} deg"
+        for other in result.alternatives
+        if other.probability >= _MENTIONED
+    ]
+    return "; ".join(listed) or "none that may be right"
 
 
 def _plain(value: Any) -> Any:

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.lax import Precision
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.geometry.neighbors import squared_distances, without_padding
+from jaxreg.geometry.neighbors import knn, squared_distances, without_padding
+from jaxreg.judge.surface import NEIGHBORS, Examined, examine
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.descriptors import (
     INVARIANTS,
@@ -44,6 +45,7 @@ class Described(NamedTuple):
     mask: Bool[Array, "n"]
     grid: NearestGrid
     spacing: Float[Array, ""]
+    examined: Examined
 
 
 class Compared(NamedTuple):
@@ -60,6 +62,7 @@ def describe(
     *,
     unit: Float[Array, ""] | float,
     normals: Float[Array, "n 3"] | None = None,
+    neighbors: Int[Array, "n k"] | None = None,
     config: SearchConfig = _DEFAULT,
 ) -> Described:
     """Describe a cloud, as `search_described` takes it.
@@ -86,6 +89,8 @@ def describe(
     if normals is None:
         normals = gaussian_normals(points, squared, valid)
     normals = jax.lax.stop_gradient(without_padding(normals, valid))
+    if neighbors is None:
+        neighbors = knn(points, min(NEIGHBORS, len(points) - 1), valid)
     return Described(
         points,
         normals,
@@ -94,6 +99,7 @@ def describe(
         valid,
         nearest_grid(points, valid, margin=SCREEN_WIDTH),
         mean_spacing(squared, valid),
+        examine(points, normals, neighbors, valid),
     )
 
 

@@ -17,13 +17,16 @@ from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import check_cloud, describe
 from jaxreg.search.learned import Network
 from jaxreg.search.nearest import nearest_packed
-from jaxreg.search.ranking import NEAR_WIDTH, sparsity_factor
 from jaxreg.search.stages import Search, check_transform, search_described
 from jaxreg.types import GlobalRegistration, RigidTransform
 
 _DEFAULT = SearchConfig()
 _RMS_OF_UNIT_SPHERE = 0.5
 """Root mean square radius of a usual shape that touches the unit sphere (ModelNet40: 0.4 to 0.6)."""
+NEAR_WIDTH = 0.05
+"""Gaussian width of the distance at which a point of the result is trusted, in units of the search."""
+_DENSE_SPACING = 0.035
+"""Mean distance to the nearest point, in units of the search, up to which a cloud counts as dense."""
 
 
 def register_global(
@@ -43,13 +46,13 @@ def register_global(
     `jaxreg.load_features`), or by your own `similarity`, the cosines in [-1, 1] of any features.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
-    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `ranking.NEAR_WIDTH` units of
+    `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w NEAR_WIDTH units of
     the search. The pose is differentiable in both clouds, through the last refinement only: the
     search is discrete.
 
     `max_angle` (radians) bounds the rotation, which decides between the poses of a symmetric shape;
-    if the search finds no pose within it, the best of all is returned. `score` is that of
-    `ranking`, of the pose before the last refinement.
+    if the search finds no pose within it, the best of all is returned. `score` is
+    the log odds of the pose before the last refinement (`jaxreg.judge`).
 
     Raises:
       ValueError: a cloud is not (n, 3) of floats or has fewer than four rows, a mask or the similarity
@@ -63,7 +66,9 @@ def register_global(
     found = search_described(
         *described, network=network, similarity=similarity, max_angle=max_angle, config=config
     )
-    sparsity = sparsity_factor(described[0].spacing, described[1].spacing)
+    spacing = jnp.maximum(described[0].spacing, described[1].spacing)
+    # How much farther apart than in dense clouds the points of matching surfaces lie.
+    sparsity = jnp.maximum(spacing / _DENSE_SPACING, 1)
     start = jax.tree.map(lambda leaf: leaf[0], found.poses)
     pose = _refined((x, y), (source_mask, reference_mask), start, sparsity, config.final)
     masks = described[0].mask, described[1].mask

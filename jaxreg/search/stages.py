@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import rigid
+from jaxreg.judge.evidence import read_evidence
+from jaxreg.judge.odds import log_odds
+from jaxreg.judge.surface import Examined
 from jaxreg.search.alignment import align_coarse, align_fine
 from jaxreg.search.candidates import MATCHES, select_candidates
 from jaxreg.search.compatibility import compatibility
@@ -26,14 +29,7 @@ from jaxreg.search.hypotheses import (
     screen,
 )
 from jaxreg.search.learned import Network
-from jaxreg.search.nearest import NearestGrid
-from jaxreg.search.ranking import (
-    break_ties,
-    score_of,
-    score_terms,
-    score_terms_by_grid,
-    sparsity_factor,
-)
+from jaxreg.search.nearest import NearestGrid, lookup, nearest_packed
 from jaxreg.search.surface import Surface, thinned
 from jaxreg.types import RigidTransform
 
@@ -47,7 +43,7 @@ _ALIGNED_APART = Separation(angle=0.1, distance=0.05)
 
 
 class Search(NamedTuple):
-    """The aligned poses (leading axis), the best first, with their scores (`ranking`).
+    """The aligned poses (leading axis), the best first, with their scores: log odds (`jaxreg.judge`).
 
     Poses that turn by more than the search permits are not `allowed`, and come last.
     """
@@ -63,7 +59,7 @@ class _Problem(NamedTuple):
     source: Surface
     reference: Surface
     grids: tuple[NearestGrid, NearestGrid]
-    sparsity: Float[Array, ""]
+    examined: tuple[Examined, Examined]
     max_angle: Float[Array, ""] | float
 
 
@@ -93,7 +89,7 @@ def search_described(
         compared.source,
         compared.reference,
         (source.grid, reference.grid),
-        sparsity_factor(source.spacing, reference.spacing),
+        (source.examined, reference.examined),
         max_angle,
     )
     poses = _screened(_hypotheses(compared, config), also, problem, config)
@@ -177,14 +173,13 @@ def _coarsely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransfor
 
 def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> RigidTransform:
     """The distinct poses that score best at a glance: the fine alignment is what takes time."""
-    source, reference, grids, sparsity, max_angle = problem
+    grids, (source, reference), max_angle = problem[2:]
+    few, fewer = (cloud.points[::_COARSE_STEP] for cloud in (source, reference))
 
     def at_a_glance(pose: RigidTransform):
-        return score_of(
-            score_terms_by_grid(
-                pose, source, reference, grids, step=_COARSE_STEP, sparsity=sparsity
-            )
-        )
+        there = lookup(grids[1], rigid.apply(pose, few))
+        back = lookup(grids[0], rigid.apply(rigid.inverse(pose), fewer))
+        return log_odds(read_evidence(pose, source, reference, there, back, step=_COARSE_STEP))
 
     score, allowed = jax.vmap(at_a_glance)(poses), _turns_less(poses, max_angle)
     count = min(config.aligned, len(score))
@@ -197,12 +192,18 @@ def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
 
 
 def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
-    """The poses, the allowed ones first, then by their score, with ties broken."""
-    source, reference, _, sparsity, max_angle = problem
-    terms = jax.lax.map(lambda pose: score_terms(pose, source, reference, sparsity=sparsity), poses)
+    """The poses, the allowed ones first, then by what speaks for them."""
+    source, reference = problem.examined
+
+    def judged(pose: RigidTransform):
+        moved = rigid.apply(pose, source.points)
+        there = nearest_packed(moved, reference.points, reference.mask)
+        back = nearest_packed(reference.points, moved, source.mask)
+        return log_odds(read_evidence(pose, source, reference, there, back))
+
+    score = jax.lax.map(judged, poses)
     # Again, because alignment may have turned a pose out of the bounds of the search.
-    allowed = _turns_less(poses, max_angle)
-    score = break_ties(score_of(terms), terms.plane, allowed)
+    allowed = _turns_less(poses, problem.max_angle)
     order = jnp.lexsort((-score, ~allowed))
     return Search(best_of(poses, order), score[order], allowed[order])
 

@@ -36,11 +36,14 @@ def sample_shape(seed: int, index: int, *, points: int) -> np.ndarray:
             f"seed = {seed} and index = {index} must be 0 or more, points = {points} at least 2."
         )
     rng = np.random.default_rng((seed, index))
-    surface = _normalised(_FAMILIES[index % len(_FAMILIES)](rng))
-    surface = surfaces.warp(rng, _attached(rng, surface), amount=_WARP)
-    cloud = surfaces.sample(rng, surface, points)
+    cloud = surfaces.sample(rng, _surface(rng, index), points)
     cloud -= cloud.mean(axis=0)
     return (cloud / np.linalg.norm(cloud, axis=1).max()).astype(np.float32)
+
+
+def sample_surface(seed: int, index: int) -> surfaces.Triangles:
+    """The surface of shape `index` of a seed, about as large as the unit sphere."""
+    return _surface(np.random.default_rng((seed, index)), index)
 
 
 def load(
@@ -62,6 +65,11 @@ def load(
     indices = range(first, first + count)
     clouds = np.stack([sample_shape(seed, index, points=points) for index in indices])
     return clouds, np.array([index % len(_FAMILIES) for index in indices], np.int32)
+
+
+def _surface(rng: Generator, index: int) -> surfaces.Triangles:
+    surface = _normalised(_FAMILIES[index % len(_FAMILIES)](rng))
+    return surfaces.warp(rng, _attached(rng, surface), amount=_WARP)
 
 
 def _normalised(surface: surfaces.Triangles) -> surfaces.Triangles:

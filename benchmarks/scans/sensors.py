@@ -1,0 +1,206 @@
+"""Pairs of real scans of many sensors, whose truth is known: every source is turned by any rotation.
+
+    python -m benchmarks.scans.sensors [--data-root DATA] [--sensors balm bunny_turntable]
+
+registers every pair by `jaxreg.register`. A data set is a folder of `scans/` (pairs.json, and
+scan_K.npz with `points`), or the fragments of 7Scenes with their official lists of pairs.
+"""
+
+import dataclasses
+import json
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from benchmarks import record
+from jaxreg.cli import process
+from jaxreg.data import data_root
+from jaxreg.data.seven_scenes import read_fragment
+from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.types import RigidTransform
+
+LOW = 0.3
+"""Pairs that overlap by less than this are reported apart."""
+RIGHT = {
+    "balm": (5.0, 0.5),
+    "bunny_turntable": (5.0, 0.010),
+    "redkitchen_frames": (8.0, 0.25),
+    "kitti00": (5.0, 1.0),
+    "opencalib": (5.0, 0.8),
+    "redkitchen_lomatch": (15.0, 0.3),
+    "redkitchen": (15.0, 0.3),
+}
+"""Within how many degrees, and metres at the overlap's centroid, a pose is right: the truth of a
+data set is good to about a third of that."""
+_LISTS = {"redkitchen_lomatch": "gt_3dlomatch.log", "redkitchen": "gt.log"}
+_FRAGMENTS = "7scene/7-scenes-redkitchen"
+_FRAGMENT_REACH = 0.05
+
+
+class TruePair(NamedTuple):
+    """Two clouds, the pose that maps the source to the reference, and what is right."""
+
+    name: str
+    source: np.ndarray
+    reference: np.ndarray
+    truth: np.ndarray | None
+    overlap: float
+    within: tuple[float, float]
+    """Degrees, and metres at `centre`."""
+    centre: np.ndarray
+
+    def is_right(self, pose: RigidTransform, times: float = 1.0) -> bool:
+        """Whether a pose is within `times` the tolerance."""
+        if self.truth is None:
+            return False
+        angle = rotation_angle_deg(pose.rotation, self.truth[:3, :3])
+        change = (pose.rotation - self.truth[:3, :3]) @ self.centre
+        moved = np.linalg.norm(change + pose.translation - self.truth[:3, 3])
+        return bool(angle < times * self.within[0] and moved < times * self.within[1])
+
+
+def true_pairs(root: Path, sensor: str) -> Iterator[TruePair]:
+    """The pairs of a data set, in its order; none if it is not there."""
+    listed = _listed(root, sensor) if sensor in _LISTS else _drawn(root, sensor)
+    for number, (source, reference, truth, overlap, reach) in enumerate(listed):
+        name = f"{sensor}/{number}"
+        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        turn = Rotation.random(random_state=rng).as_matrix()
+        truth = truth @ _matrix(turn.T)
+        yield make_pair(name, source @ turn.T, reference, truth, overlap, RIGHT[sensor], reach)
+
+
+def make_pair(name, source, reference, truth, overlap, within, reach) -> TruePair:
+    """A pair whose errors are measured at the centroid of the overlapping part."""
+    moved = source @ truth[:3, :3].T + truth[:3, 3]
+    near = cKDTree(reference).query(moved, distance_upper_bound=reach)[0] < np.inf
+    centre = source[near].mean(axis=0) if near.any() else source.mean(axis=0)
+    return TruePair(name, source, reference, truth, overlap, within, centre)
+
+
+def _drawn(root: Path, sensor: str):
+    folder = root / "scans" / sensor
+    if not folder.is_dir():
+        return
+    content = json.loads((folder / "pairs.json").read_text())
+    for pair in content["pairs"]:
+        clouds = [
+            np.load(folder / f"scan_{pair[side]}.npz")["points"].astype(np.float64)
+            for side in ("source", "reference")
+        ]
+        overlap = min(pair["overlap_source"], pair["overlap_reference"])
+        yield *clouds, np.array(pair["T"], np.float64), overlap, content["reach"]
+
+
+def _listed(root: Path, sensor: str):
+    folder = root / _FRAGMENTS
+    if not folder.is_dir():
+        return
+    lines = (folder / _LISTS[sensor]).read_text().splitlines()
+    for start in range(0, len(lines) - 4, 5):
+        first, second = (int(word) for word in lines[start].split()[:2])
+        truth = np.array([line.split() for line in lines[start + 1 : start + 5]], np.float64)
+        reference, source = (
+            read_fragment(folder / f"cloud_bin_{i}.ply").astype(np.float64) for i in (first, second)
+        )
+        moved = source @ truth[:3, :3].T + truth[:3, 3]
+        overlap = min(
+            float((cKDTree(b).query(a)[0] < _FRAGMENT_REACH).mean())
+            for a, b in ((moved, reference), (reference, moved))
+        )
+        yield source, reference, truth, overlap, _FRAGMENT_REACH
+
+
+def _matrix(rotation: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    data_root: str | None = None
+    sensors: tuple[str, ...] = tuple(RIGHT)
+    record: bool = True
+    """Write benchmarks/results/sensors.json."""
+
+
+def measure(root: Path, sensor: str) -> Iterator[dict]:
+    """One entry per pair: whether the pose is right, believed, and whether an alternative is right."""
+    from jaxreg.scans.pair import register
+
+    for pair in true_pairs(root, sensor):
+        start = time.perf_counter()
+        found = register(pair.source, pair.reference)
+        seconds = time.perf_counter() - start
+        right = pair.is_right(found.transform)
+        listed = any(pair.is_right(other.transform) for other in found.alternatives)
+        yield {
+            "name": pair.name,
+            "low": pair.overlap < LOW,
+            "right": right,
+            "listed": right or listed,
+            "success": found.success,
+            "probability": found.probability,
+            "seconds": seconds,
+        }
+
+
+def summary(entries: list[dict]) -> dict:
+    """Counts of a group of pairs."""
+    right = np.array([e["right"] for e in entries], bool)
+    success = np.array([e["success"] for e in entries], bool)
+    return {
+        "pairs": len(entries),
+        "right": int(right.sum()),
+        "listed": int(sum(e["listed"] for e in entries)),
+        "believed": int(np.sum(right & success)),
+        "wrong": int(np.sum(~right & success)),
+        "seconds": float(np.median([e["seconds"] for e in entries])),
+    }
+
+
+COLUMNS = {
+    "pairs": "pairs",
+    "right": "right",
+    "listed": "right, or among the alternatives",
+    "believed": "right and called a success",
+    "wrong": "wrong and called a success",
+    "seconds": "median s",
+}
+
+
+def main(options: Options) -> None:
+    """Register all pairs of every sensor and print a table."""
+    root = data_root(options.data_root)
+    if root is None:
+        raise SystemExit("no data: set $JAXREG_DATA or give --data-root.")
+    process.enable_compilation_cache()
+    rows = {}
+    for sensor in options.sensors:
+        entries = list(measure(root, sensor))
+        for key, label, low in (("low", "overlap below .3", True), ("high", ".3 and more", False)):
+            if group := [e for e in entries if e["low"] is low]:
+                rows[f"{sensor}_{key}"] = {"label": f"{sensor}, {label}"} | summary(group)
+                print(rows[f"{sensor}_{key}"], flush=True)
+    if options.record:
+        record.write(
+            "sensors",
+            question="How many pairs of real scans of other sensors are registered?",
+            command=record.command("benchmarks.scans.sensors"),
+            columns=COLUMNS,
+            rows=rows,
+        )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

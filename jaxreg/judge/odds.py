@@ -1,0 +1,57 @@
+"""From evidence to probabilities: which of several poses is right, if any.
+
+Of distinct poses at most one is right. With ``s_k`` the log odds that the evidence gives pose k,
+
+    P(pose k is right) = exp(s_k) / (1 + sum_j exp(s_j)),
+
+and the one in the denominator stands for "none of them". So one number ranks the poses, settles
+close calls and is the probability that the user sees: two poses that agree equally well share it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxreg.judge.evidence import Evidence
+
+INTERCEPT = 12.0
+WEIGHTS = Evidence(
+    smaller=2.24, larger=-1.68, distance=-1.77, rough_distance=-4.45, rough_facing=-7.4,
+    disagreement=-7.54, beside=0.0, unseen=-29.9, rough=0.0, ends=0.0, held=3.98,
+)  # fmt: skip
+"""What one unit of every feature adds to the log odds."""
+
+
+def features(evidence: Evidence) -> Evidence:
+    """The evidence as the log odds take it: shares and lengths by their logarithm."""
+    return evidence._replace(
+        smaller=jnp.log(evidence.smaller + 0.003),
+        larger=jnp.log(evidence.larger + 0.003),
+        distance=jnp.log(evidence.distance),
+        rough_distance=jnp.log(evidence.rough_distance),
+        held=jnp.log10(jnp.maximum(evidence.held, 1e-6)),
+    )
+
+
+def log_odds(evidence: Evidence) -> Float[Array, "*k"]:
+    """``s = w_0 + sum_i w_i f_i``: the larger, the more speaks for the pose.
+
+    Fitted by research/fit_judge.py; the head of that file says on what.
+    """
+    terms = jax.tree.map(jnp.multiply, WEIGHTS, features(evidence))
+    return INTERCEPT + jnp.sum(jnp.stack(terms), axis=0)
+
+
+def probabilities(
+    score: Float[Array | np.ndarray, "k"], counted: Bool[Array, "k"] | None = None
+) -> Float[Array, "k"]:
+    """The chance of every pose to be the right one; 0 where a pose is not `counted`.
+
+    Count of poses that are the same but for noise only one, or they share its chance.
+    """
+    score = jnp.asarray(score)
+    if counted is not None:
+        score = jnp.where(counted, score, -jnp.inf)
+    none = jnp.zeros(1, score.dtype)
+    return jax.nn.softmax(jnp.concatenate([score, none]))[:-1]

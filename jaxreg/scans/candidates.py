@@ -1,0 +1,127 @@
+"""The poses that a search proposes for two scans, refined and judged with more points than it had."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
+from jaxreg.judge.evidence import REACH, Evidence, read_evidence
+from jaxreg.judge.odds import log_odds
+from jaxreg.judge.surface import Examined
+from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.kdtree import IndexedCloud, iterate_all
+from jaxreg.refine.robust import Weighting
+from jaxreg.types import RigidTransform
+
+_APART_DEG, _APART = 6.0, 0.1
+"""Poses nearer to each other than this (in the unit of the frame) are one and the same."""
+_REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)
+"""How a pose is refined before it is judged: surfaces a spacing apart say little."""
+_STEP = 2
+"""Every second point looks for a partner then."""
+_COUNTS = (1, 4, 16, 64)
+"""Poses are judged in batches of these sizes, so that few programs are compiled."""
+
+
+class Judged(NamedTuple):
+    """Distinct poses (leading axis) in the frame of a pair, the most plausible first, and why."""
+
+    poses: RigidTransform
+    evidence: Evidence
+    score: Float[np.ndarray, "k"]
+
+
+class Clouds(NamedTuple):
+    """Two clouds in one frame: with trees, and as the judge sees them in their own units."""
+
+    source: IndexedCloud
+    reference: IndexedCloud
+    examined: tuple[Examined, Examined]
+
+    def judge(self, poses: RigidTransform) -> tuple[Evidence, Float[np.ndarray, "k"]]:
+        """The evidence for every pose (leading axis), and its log odds (`jaxreg.judge`)."""
+        count = len(poses.rotation)
+        poses = _padded(poses)
+        spacings = (
+            float(cloud.spacing) * index.scale
+            for cloud, index in zip(self.examined, self[:2], strict=True)
+        )
+        reach = 1.0001 * REACH * max(spacings)
+        there = self.reference.nearest(self.source.moved_by(poses), within=reach)[1]
+        back = self.source.nearest(self.reference.moved_back_by(poses), within=reach)[1]
+        there, back = (
+            np.pad(index.astype(np.int32), [(0, 0), (0, len(cloud.padded) - index.shape[1])])
+            for index, cloud in zip((there, back), self[:2], strict=True)
+        )
+        scales = self.source.scale, self.reference.scale
+        evidence, score = _read(poses, *self.examined, scales, there, back)
+        evidence = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
+        return evidence, np.asarray(score, np.float64)[:count]
+
+
+def _padded(poses: RigidTransform) -> RigidTransform:
+    """The poses, the last one repeated up to one of a few counts."""
+    count = len(poses.rotation)
+    size = next((size for size in _COUNTS if size >= count), count)
+    return RigidTransform(*(np.concatenate([p, p[-1:].repeat(size - count, 0)]) for p in poses))
+
+
+@jax.jit
+def _read(poses, source, reference, scales, there, back):
+    source, reference = (
+        cloud._replace(points=cloud.points * scale, spacing=cloud.spacing * scale)
+        for cloud, scale in zip((source, reference), scales, strict=True)
+    )
+    poses = RigidTransform(*(part.astype(source.points.dtype) for part in poses))
+    read = functools.partial(read_evidence, source=source, reference=reference)
+    evidence = jax.vmap(lambda p, i, j: read(p, there=i, back=j))(poses, there, back)
+    return evidence, log_odds(evidence)
+
+
+def judged(
+    clouds: Clouds,
+    poses: RigidTransform,
+    score: Float[np.ndarray, "s"],
+    *,
+    distance: float,
+    most: int,
+) -> Judged:
+    """At most `most` distinct ones of the poses, the best by `score`, refined and judged.
+
+    `distance` is the largest between corresponding points, in the unit of the frame.
+    """
+    weighting = Weighting(_REFINE.kernel, None, distance, _REFINE.trim)
+    chosen = _distinct(poses, score, most)
+    poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
+    moved = iterate_all(
+        _padded(poses), clouds.source, clouds.reference, weighting, config=_REFINE, step=_STEP
+    )
+    count = len(chosen)
+    poses = RigidTransform(nearest_rotation(moved.rotation[:count]), moved.translation[:count])
+    return ranked(poses, *clouds.judge(poses))
+
+
+def ranked(poses: RigidTransform, evidence: Evidence, score: Float[np.ndarray, "k"]) -> Judged:
+    """The distinct ones of judged poses, the most plausible first."""
+    order = _distinct(poses, score, len(score))
+    return Judged(*jax.tree.map(lambda leaf: leaf[order], (poses, evidence, score)))
+
+
+def merged(one: Judged, other: Judged) -> Judged:
+    """Both, the most plausible first, and of poses that are the same the better one."""
+    return ranked(*jax.tree.map(lambda a, b: np.concatenate([a, b]), one, other))
+
+
+def _distinct(poses: RigidTransform, score: np.ndarray, most: int) -> list[int]:
+    chosen: list[int] = []
+    for i in np.argsort(-score, kind="stable").tolist():
+        if len(chosen) == most:
+            break
+        turned = rotation_angle_deg(poses.rotation[chosen], poses.rotation[i][None])
+        moved = np.linalg.norm(poses.translation[chosen] - poses.translation[i], axis=1)
+        if np.all((turned > _APART_DEG) | (moved > _APART)):
+            chosen.append(i)
+    return chosen
