@@ -18,7 +18,8 @@ def read(path: Path) -> Scan:
         content = _loaded(path)
     except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
         hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
-        raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
+        told = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} cannot be read as {path.suffix} ({told}): {hint}.") from None
     if isinstance(content, dict):
         return Scan(_chosen(content, path))
     return Scan(_points(content, str(path)))

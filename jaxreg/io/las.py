@@ -1,5 +1,7 @@
 """LAS and LAZ, the files of airborne and terrestrial laser scanners, by laspy (extra `las`)."""
 
+import os
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,10 @@ import numpy as np
 from jaxreg._extras import extra
 from jaxreg.io.contents import Scan
 
+_CHUNK = 16
+"""Bytes that a chunk of a LAZ file takes at least: its first point is not packed."""
+_PACKED = 100
+"""Points are packed to less than this share of their size in damaged files alone."""
 _LARGEST = 2**31 - 1
 """LAS stores coordinates as integers of 32 bits, times a scale, plus an offset."""
 
@@ -17,14 +23,38 @@ def read(path: Path) -> Scan:
     try:
         with laspy.open(path) as file:
             # A scan takes two bytes a point or more; a damaged count would be unpacked for minutes.
-            if file.header.point_count > path.stat().st_size:
+            size, rows = path.stat().st_size, file.header.point_count
+            if file.header.are_points_compressed:
+                _check_chunks(path, file.header.offset_to_point_data, size)
+            if rows > size or rows * file.header.point_format.size > _PACKED * size:
                 raise ValueError(f"it announces {file.header.point_count} points")
             return Scan(np.asarray(file.read().xyz, np.float64))
-    except Exception as error:  # noqa: BLE001 - laspy and its backends raise types of their own
+    except BaseException as error:  # laspy and its backends raise types of their own, panics too
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
         raise ValueError(
             f"{path} cannot be read as {path.suffix} ({type(error).__name__}: {error}): "
             "it is malformed or truncated; export it again."
         ) from None
+
+
+def _check_chunks(path: Path, start: int, size: int) -> None:
+    """Raises ValueError where the table of a LAZ file's chunks announces more than the file holds.
+
+    The decompressor reserves memory for as many as it says, and ends the process where it gets none.
+    """
+    with path.open("rb") as file:
+        file.seek(start)
+        (table,) = struct.unpack("<q", file.read(8))
+        if table == -1:  # written to a stream: the place stands at the end
+            file.seek(-8, os.SEEK_END)
+            (table,) = struct.unpack("<q", file.read(8))
+        if not start < table <= size - 8:
+            raise ValueError("the table of its chunks lies outside of the file")
+        file.seek(table)
+        _, chunks = struct.unpack("<II", file.read(8))
+    if chunks > size // _CHUNK:
+        raise ValueError(f"it announces {chunks} chunks")
 
 
 def write(path: Path, points: np.ndarray) -> None:

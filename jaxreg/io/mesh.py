@@ -69,11 +69,14 @@ def sampled(mesh: Mesh) -> Scan:
     """Points drawn evenly from the surface of a mesh; its vertices where it has no area."""
     import trimesh  # a second of start-up that other formats need not pay
 
-    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    area = surface.area
-    if not (np.isfinite(area) and area > 0):
-        return Scan(mesh.vertices)
-    points = np.asarray(trimesh.sample.sample_surface(surface, _POINTS, seed=0)[0], np.float64)
+    # A triangle without three finite corners has no surface.
+    whole = np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1)
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces[whole], process=False)
+    with np.errstate(all="ignore"):
+        area = surface.area
+        if not (np.isfinite(area) and area > 0):
+            return Scan(mesh.vertices)
+        points = np.asarray(trimesh.sample.sample_surface(surface, _POINTS, seed=0)[0], np.float64)
     return Scan(points, (f"a mesh of {len(mesh.faces):,} triangles, sampled over its surface",))
 
 
