@@ -79,7 +79,8 @@ def read_scan(path: str | Path) -> Scan:
         raise ValueError(f"{path}: there is no such file: correct the path.")
     if path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes): write it again.")
-    with packed.unpacked(path) as file:
+    # A damaged file holds numbers that overflow, and NaN that signal.
+    with packed.unpacked(path) as file, np.errstate(all="ignore"):
         scan = _READERS[suffix(path)](file)
         if len(scan.points) == 0:
             raise ValueError(f"{path} holds no point: write it again, or choose another file.")

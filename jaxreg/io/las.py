@@ -21,6 +21,7 @@ def read(path: Path) -> Scan:
     """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
     laspy = _laspy(path)
     try:
+        _check_header(path)
         with laspy.open(path) as file:
             # A scan takes two bytes a point or more; a damaged count would be unpacked for minutes.
             size, rows = path.stat().st_size, file.header.point_count
@@ -36,6 +37,18 @@ def read(path: Path) -> Scan:
             f"{path} cannot be read as {path.suffix} ({type(error).__name__}: {error}): "
             "it is malformed or truncated; export it again."
         ) from None
+
+
+def _check_header(path: Path) -> None:
+    """Raises ValueError where the header leads out of the file: laspy would read on regardless."""
+    with path.open("rb") as file:
+        head = file.read(104)
+    size = path.stat().st_size
+    if len(head) < 104:
+        raise ValueError("its header is cut")
+    header, points, records = struct.unpack_from("<HII", head, 94)
+    if not 227 <= header <= points <= size or records > size // 54:
+        raise ValueError("its header leads out of the file")
 
 
 def _check_chunks(path: Path, start: int, size: int) -> None:

@@ -51,5 +51,4 @@ def _binary(path: Path, content: bytes) -> np.ndarray:
             f"{path} is truncated: it announces {count} triangles, and holds "
             f"{max(0, len(content) - _HEADER) // _TRIANGLE}: export it again."
         )
-    with np.errstate(invalid="ignore"):  # of NaN that signal
-        return np.frombuffer(content, _ROW, count, _HEADER)["corners"].astype(np.float64)
+    return np.frombuffer(content, _ROW, count, _HEADER)["corners"].astype(np.float64)
