@@ -1,9 +1,9 @@
 """Calibrate a range sensor by gradients through registration.
 
-A scanner adds an unknown constant to every range that it measures. From two scans of one room, taken
-from two unknown poses, that constant can be learned: with the right one the scans fit each other best.
-The loss is the residual after registration, and its derivatives run through all iterations of ICP.
-Prints the offset at each step; about ten seconds on a laptop.
+A scanner adds an unknown constant to every range that it measures. That constant can be learned
+from two scans of one room, taken from two unknown poses: with the right one the scans fit each
+other best. The loss is the residual after registration, and its derivatives run through all
+iterations of ICP. Prints the offset at each step; about ten seconds on a laptop.
 """
 
 import jax
@@ -19,14 +19,14 @@ CONFIG = RefineConfig(iterations=20, kernel="none")
 
 
 def scan_room(points, rotation, position, rng):
-    """What the scanner reports of `points` (n, 3) from a pose: in its own frame, ranges too long."""
+    """What the scanner measures of `points` (n, 3) from a pose, in its own frame."""
     seen = (points - position) @ rotation
     ranges = np.linalg.norm(seen, axis=1, keepdims=True)
     return seen * (1 + (TRUE_OFFSET + rng.normal(0, 0.002, ranges.shape)) / ranges)
 
 
 def corrected(scan, offset):
-    """The scan with `offset` metres taken off every range."""
+    """The scan with `offset` metres subtracted from every range."""
     return scan * (1 - offset / jnp.linalg.norm(scan, axis=1, keepdims=True))
 
 

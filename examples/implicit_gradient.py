@@ -1,8 +1,9 @@
-"""Which points decide where a scan comes to lie? Two derivatives of one registration.
+"""Which points decide the pose of a scan? Two derivatives of one registration.
 
-The derivative of the pose in every point of the source: once back through all iterations of GICP, once
-by the equation that the solution satisfies. They agree where the iterations have converged, and the
-second needs the memory and the time of one iteration. Prints both, and how far they differ.
+The derivative of the pose with respect to every point of the source: once back through all
+iterations of GICP, once from the equation that the solution satisfies. They agree if the iterations
+have converged, and the second needs the memory and time of one iteration. Prints both, and how far
+they differ.
 """
 
 import time
@@ -17,7 +18,7 @@ source, reference = shape[::2] + jnp.array([0.02, -0.01, 0.03]), shape[1::2]
 
 
 def influence(gradient: str) -> jax.Array:
-    """By how much each source point moves the solution when it moves, in shares of its motion (n,)."""
+    """How far the solution moves when a source point moves, as a share of that motion (n,)."""
     config = RefineConfig(iterations=50, kernel_annealing=1.0, gradient=gradient)
     of_points = jax.jit(jax.jacrev(lambda x: gicp(x, reference, config=config).translation))
     of_points(source)  # compiles

@@ -1,7 +1,8 @@
 """jaxreg: rigid point cloud registration in pure JAX.
 
-Everything public is listed in `__init__.pyi`, by topic, and is imported when it is first used; modules
-behind these names may move. Functions of one pair are pure: `jax.jit`, `jax.vmap` and `jax.grad` them.
+`__init__.pyi` lists the public API by topic; a name is imported when it is first used, and the
+modules behind these names may move. Functions of one pair are pure: use them under `jax.jit`,
+`jax.vmap` and `jax.grad`.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Libraries that only some uses need are extras of the package: what a missing one is called."""
+"""Optional dependencies: the error when one is missing names the extra to install."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def extra(name: str, purpose: str) -> Iterator[None]:
-    """Put the imports of what the extra `name` installs in here; `purpose` begins the message.
+    """Wrap the imports of what the extra `name` installs; `purpose` begins the message.
 
     Raises:
-      ImportError: a library is not installed; the message says what for, and how to install it.
+      ImportError: a library is not installed; the message says what needs it and how to install it.
     """
     try:
         yield

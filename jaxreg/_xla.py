@@ -1,6 +1,7 @@
 """Identities that make XLA:CPU compile something faster; correct, and harmless, everywhere.
 
-Each was measured on jaxlib 0.10 (benchmarks/speed/speed.py shows the stages); check again on a new one.
+Each was measured on jaxlib 0.10 (benchmarks/speed/speed.py shows the stages); check them on a newer
+one.
 """
 
 import jax
@@ -12,7 +13,7 @@ def row_min(x: Shaped[Array, "n m"]) -> Shaped[Array, "n"]:
     """``min_j x[i, j]``, for integers too; five times as fast on a CPU as `jnp.min` along rows.
 
     XLA:CPU takes the minimum of a row one number at a time, but that of two blocks with vector
-    instructions. So rows are folded four times first; in an odd row the halves overlap.
+    instructions. So rows are first folded four times; in an odd row the halves overlap.
     """
     for _ in range(4):
         half = (x.shape[1] + 1) // 2
@@ -23,7 +24,7 @@ def row_min(x: Shaped[Array, "n m"]) -> Shaped[Array, "n"]:
 def at_row_min(x: Float[Array, "n m"]) -> Bool[Array, "n m"]:
     """Where the entries of a row equal its minimum, up to rounding; at least one in every row.
 
-    Without the allowance there might be none: XLA computes `x` anew for the comparison, in another
+    Without the allowance there might be none: XLA computes `x` again for the comparison, in another
     kernel, and the last bit may differ.
     """
     x = jax.lax.stop_gradient(x)
@@ -34,9 +35,9 @@ def at_row_min(x: Float[Array, "n m"]) -> Bool[Array, "n m"]:
 def written_out(x: Shaped[Array, "n *rest"]) -> Shaped[Array, "n *rest"]:
     """`x`, written to memory before anything reads it.
 
-    XLA merges a transposition with what comes before or after it, and then goes through memory at
-    strides, number by number; alone it is ten times as fast. `optimization_barrier` is gone when that
-    happens, but nothing crosses the border of a loop, so the rows are copied in one. Has no derivative.
+    XLA fuses a transpose with what comes before or after it, and then goes through memory at
+    strides, number by number; alone it is ten times as fast. XLA removes `optimization_barrier`
+    before that, but it does not fuse across loops, so the rows are copied in a loop. Has no derivative.
     """
     n = x.shape[0]
     half = (n + 1) // 2
@@ -63,7 +64,7 @@ def gradient_written_out(x: Shaped[Array, "*n c"]) -> Shaped[Array, "*n c"]:
 
 
 def unfused(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`x`, after which a kernel of XLA:CPU ends: for a large product that arithmetic follows.
+    """`x`, as the end of a kernel of XLA:CPU: for a large product that is followed by arithmetic.
 
     XLA:CPU hands products to the library YNN together with the arithmetic around them, which costs a
     fifth more than the product and the arithmetic in two kernels. YNN has no `reduce_precision`, and

@@ -8,10 +8,9 @@ from jax.custom_batching import sequential_vmap
 
 
 def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``jax.vmap(function)``; on a CPU a loop over the batch.
+    """``jax.vmap(function)``, or on a CPU a loop over the batch.
 
-    What one pair needs stays in the caches, where the arrays of a whole batch go through memory once
-    for every operation.
+    One pair fits into the cache; a whole batch would go through main memory once per operation.
     """
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
@@ -19,16 +18,16 @@ def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def one_at_a_time(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """``function(inputs, constants)`` whose `vmap`, and that of its gradient, is a loop over the batch.
+    """``function(inputs, constants)`` that is batched, with its gradient, by a loop.
 
     For a part of a program whose other parts need the whole batch at once, as BatchNorm does; see
-    `map_pairs`. The gradient computes the function again, so that nothing but its arguments is kept.
-    Reverse mode only, and `constants` has no derivative. Off the CPU it is `function` itself.
+    `map_pairs`. The gradient recomputes the function and stores only its arguments. Reverse mode
+    only, and `constants` has no derivative. Off the CPU it is `function` itself.
     """
     if jax.default_backend() != "cpu":
         return function
 
-    # sequential_vmap alone knows forward mode only.
+    # On its own, sequential_vmap supports forward mode only.
     call = jax.custom_vjp(sequential_vmap(function))
 
     @sequential_vmap

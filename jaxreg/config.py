@@ -1,13 +1,12 @@
 """Every default of the library, in one place, and how files and the command line change it.
 
-A TOML file states deviations from the defaults only::
+A TOML file lists only what differs from the defaults::
 
     weights = "modelnet40"
     [model]
     k = 8
 
-``--model.k 12`` on the command line deviates from the file. The symbols of the paper stand in the
-documentation of each field.
+``--model.k 12`` on the command line overrides the file. Each field gives its symbol in the paper.
 """
 
 import dataclasses
@@ -20,14 +19,14 @@ from typing import Any, Literal
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The network; where the paper can be read in several ways, a field says which is taken."""
+    """The network. Where the paper is ambiguous, a field selects the reading."""
 
     k: int = 5
-    """K, neighbours of a point in the features and in the inlier module (self excluded)."""
+    """K: neighbours of a point, itself excluded, in the features and the inlier module."""
     k_matching: int = 5
     """K of the neighbourhood sum in Eq. 4."""
     include_self: bool = False
-    """Put the point itself in front of its K neighbours (RIENet does)."""
+    """Also count the point itself, first, as RIENet does."""
     channels: tuple[int, ...] = (32, 32, 64, 128)
     """Widths of the DGCNN layers."""
     width: int = 256
@@ -53,12 +52,12 @@ class ModelConfig:
     svd: Literal["top", "all"] = "top"
     """Points of the weighted Procrustes: the top N_c (paper) or all of them (RIENet)."""
     robust_rounds: int = 0
-    """Times that each weighted Procrustes is solved again with less weight on the pairs it cannot
-    explain (0 in the paper). Meant for inference."""
+    """How often each weighted Procrustes is solved again with less weight on pairs that do not fit
+    (0 in the paper). For inference."""
     iterations: int = 3
     """N_l, registration steps."""
     bn_momentum: float = 0.9
-    """Share of the old running statistics that a training step keeps in BatchNorm."""
+    """Share of the old running statistics that BatchNorm keeps at a training step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +73,9 @@ class LossConfig:
     lambda_: float = 1.0
     """Weight of L_sc, spatial consistency."""
     pose: float = 0.0
-    """Weight of the distances to where the true pose takes the source: no part of the method, which
-    is unsupervised. For pairs that share no point, where the four losses alone hardly move."""
+    """Weight of the distances to where the true pose takes the source: not part of the
+    (unsupervised) method. For pairs that share no point, on which the four losses alone learn
+    little."""
     beta: float = 0.01
     """beta of the Huber function in L_gc, applied to squared distances."""
     l_in: Literal["unsquared", "squared"] = "unsquared"
@@ -95,10 +95,10 @@ class PairConfig:
     kept: int = 768
     """Points of each cloud after the crop."""
     independent_crops: bool = False
-    """Crop each cloud on its own instead of sharing one viewpoint or plane."""
+    """Crop each cloud independently, instead of with one shared viewpoint or plane."""
     sampling: Literal["copy", "disjoint"] = "copy"
-    """`copy`: both clouds hold the same points. `disjoint`: they share none; each takes its own
-    half of the shape's points (or its own draw from a dense cloud)."""
+    """`copy`: both clouds have the same points. `disjoint`: they share none; each takes one half of
+    the shape's points, or its own draw from a dense cloud."""
     rotation: Literal["euler", "axis-angle", "full"] = "euler"
     """Three Euler angles, an axis and an angle, or a uniformly random rotation."""
     rotation_max_deg: float = 45.0
@@ -115,14 +115,15 @@ class PairConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
-    """Which shapes."""
+    """Where the shapes come from."""
 
     name: Literal["modelnet40", "shapes", "folder", "seven_scenes", "icl_nuim"] = "modelnet40"
-    """Source: `shapes` is procedural and needs no file, `folder` is files of one's own."""
+    """Source: `shapes` is procedural and needs no file, `folder` means your own files."""
     folder: str = ""
-    """The folder of these files: PLY, PCD, XYZ, ... (`jaxreg.io`), with or without train/ and test/."""
+    """The folder of your own files: PLY, PCD, XYZ, ... (`jaxreg.io`), with or without train/ and
+    test/."""
     test_share: float = 0.2
-    """Share of these files, the last ones, to test on where there is no test/."""
+    """Share of these files, the last ones, to test on if there is no test/."""
     train_categories: Literal["all", "first20", "last20"] = "all"
     """ModelNet40 labels to train on."""
     test_categories: Literal["all", "first20", "last20"] = "all"
@@ -139,21 +140,21 @@ class DataConfig:
     """Draws of points from every 7Scenes fragment to test on (one in the published protocol)."""
     test_pairs_from: Literal["shapes", "file"] = "shapes"
     """`shapes`: test pairs are made from single shapes. `file`: the pairs that ICL-NUIM comes with,
-    in the pose they have there."""
+    in the poses it gives."""
     label: str = ""
-    """What figures call the test data; empty: by what is found on disk."""
+    """Name of the test data in tables; empty: chosen from what is on disk."""
     test_seed: int = 0
-    """Seed of the test pairs; not that of the training, so that all runs meet the same pairs."""
+    """Seed of the test pairs; separate from the training's, so all runs see the same pairs."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Optimisation."""
+    """The optimiser, its schedule and validation."""
 
     steps: int = 6000
     """Optimiser steps."""
     batch: int = 8
-    """Pairs in a step."""
+    """Pairs per step."""
     learning_rate: float = 1e-3
     """Peak of the schedule: linear warm-up, then cosine decay to `final_learning_rate`."""
     final_learning_rate: float = 1e-5
@@ -165,25 +166,27 @@ class TrainConfig:
     clip: float = 1000.0
     """Largest global norm of the gradient."""
     ema: float = 0.99
-    """Decay of the running mean of the weights that is validated and released."""
+    """Decay of the running average of the weights; the average is what is validated and
+    released."""
     validate_every: int = 250
     """Steps between validations (and checkpoints)."""
     validation_pairs: int = 64
-    """Pairs of a validation."""
+    """Pairs per validation."""
     seed: int = 0
     """The one seed; everything random derives from it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """All of it."""
+    """A whole experiment: network, losses, pairs, data and training."""
 
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
     pairs: PairConfig = PairConfig()
-    """Pairs to train on; and to test on, where a file has no `[test_pairs]`."""
+    """Pairs to train on; and to test on, if a file has no `[test_pairs]`."""
     test_pairs: PairConfig = PairConfig()
-    """Pairs to test on. A file's `[test_pairs]` starts from its `[pairs]` and states what differs."""
+    """Pairs to test on. A file's `[test_pairs]` starts from its `[pairs]` and lists what
+    differs."""
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
     weights: str = ""
@@ -191,15 +194,15 @@ class Config:
 
 
 def available_configs() -> tuple[str, ...]:
-    """Names of the configurations that come with jaxreg, which `load_config` takes for their files."""
+    """Names of the configurations that come with jaxreg; `load_config` takes them as paths."""
     return tuple(sorted(path.stem for path in _shipped().glob("*.toml")))
 
 
 def load_config(path: str | Path) -> Config:
-    """The configuration of a TOML file of deviations from the defaults.
+    """Read a configuration from a TOML file that lists what differs from the defaults.
 
     `path` may also be one of `available_configs`, with or without ``.toml``; a file of that name in
-    the working directory goes first.
+    the working directory takes precedence.
 
     Raises:
       ValueError: the file is missing (the names are given) or not TOML, or it names an unknown
@@ -224,14 +227,14 @@ def load_config(path: str | Path) -> Config:
 
 
 def _shipped() -> Path:
-    """The folder of the configurations: in the installed package, or beside it in a checkout."""
+    """The folder of the configurations: in the installed package, or next to it in a checkout."""
     package = Path(__file__).parent
     inside = package / "configs"
     return inside if inside.is_dir() else package.parent / "configs"
 
 
 def from_dict(content: dict[str, Any], *, where: str = "configuration") -> Config:
-    """The configuration of a nested dict of deviations; errors as `load_config`."""
+    """The configuration from a nested dict of what differs; raises what `load_config` raises."""
     pairs, test_pairs = content.get("pairs", {}), content.get("test_pairs", {})
     if isinstance(pairs, dict) and isinstance(test_pairs, dict):
         content = content | {"test_pairs": pairs | test_pairs}

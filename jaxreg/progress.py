@@ -1,4 +1,4 @@
-"""The progress of a run: a bar on a terminal, elsewhere a line now and then."""
+"""The progress of a run: a bar on a terminal, otherwise an occasional line."""
 
 import contextlib
 import time
@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 _SECONDS_BETWEEN_LINES = 20.0
 
 Show = Callable[[int, str, bool], None]
-"""Shows that so many are done, with a text; True says so at once."""
+"""Shows how many are done, with a text; True shows it at once."""
 
 
 @contextlib.contextmanager
@@ -19,9 +19,9 @@ def training_progress(
 ) -> Iterator[Callable[[Mapping[str, float]], None]]:
     """Shows a run of `total` steps; call what it yields with the logged entry of every step.
 
-    An entry needs `step` and `loss`, of which the running mean is shown; `val_mie_r_deg`, where it
-    stands, is the validation error until the next, and is shown at once. A resumed run starts the
-    bar, and the clock, at its first step.
+    An entry needs `step` and `loss`, whose running mean is shown; `val_mie_r_deg`, if present, is
+    shown at once and stays as the validation error until the next. A resumed run starts the bar,
+    and the clock, at its first step.
     """
     mean, error = None, ""
     begin = "compiling the training step"
@@ -43,10 +43,10 @@ def training_progress(
 def counting_progress(
     total: int, label: str, *, console: Console | None = None
 ) -> Iterator[Callable[[int], None]]:
-    """Shows how many of `total` pairs are done, and at the end how many that was a second.
+    """Shows how many of `total` pairs are done, and at the end how many per second.
 
-    Call what it yields with each number of new ones. The throughput is that of the whole run:
-    compiling, and making the pairs, are in it.
+    Call what it yields with each number of new ones. The throughput is that of the whole run, with
+    compiling and making the pairs.
     """
     console, begin, done = console or Console(), time.monotonic(), 0
     with _display(total, "pairs", label, console) as show:
@@ -78,7 +78,7 @@ def _bar(total: int, text: str, console: Console) -> Iterator[Show]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    # The period is long enough that a validation between two steps does not upset the estimate.
+    # The period is long, so a validation between two steps does not upset the estimate.
     with Progress(*columns, console=console, speed_estimate_period=120) as progress:
         task = progress.add_task(text, total=total)
         yield lambda done, text, _: progress.update(task, completed=done, description=text)
@@ -86,7 +86,7 @@ def _bar(total: int, text: str, console: Console) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(total: int, unit: str, console: Console) -> Iterator[Show]:
-    """The first, those that are asked for, and one every 20 seconds; with the time that is left."""
+    """The first, those asked for, and one every 20 seconds; with the time left."""
     first, last = None, float("-inf")
 
     def show(done: int, text: str, at_once: bool) -> None:

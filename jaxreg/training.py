@@ -1,6 +1,6 @@
-"""Unsupervised training: the jitted step, validation, and the loop that can be stopped any time.
+"""Unsupervised training: the jitted step, validation, and the loop that can be stopped at any time.
 
-A step depends on the state and the seed only: its pairs derive from ``fold_in(seed, step)``. A run
+A step depends only on the state and the seed: its pairs derive from ``fold_in(seed, step)``. A run
 that was interrupted and resumed is therefore bit-equal to one that was not.
 """
 
@@ -41,7 +41,7 @@ _TRAIN, _INIT = 0, 1  # Streams of random keys below the seed.
 
 
 class TrainState(NamedTuple):
-    """All that a step reads and writes. `average` is the running mean of `variables`."""
+    """All that a step reads and writes. `average` is the running average of `variables`."""
 
     step: Int[Array, ""]
     variables: Variables
@@ -58,7 +58,8 @@ def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
         config.steps,
         config.final_learning_rate,
     )
-    # Forty small arrays as one vector: on one core a fifth of the step's compile time, on two none.
+    # Forty small arrays as one vector: saves a fifth of the step's compile time on one core, none
+    # on two.
     return optax.flatten(
         optax.chain(
             optax.clip_by_global_norm(config.clip),
@@ -70,7 +71,7 @@ def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 
 @functools.partial(jax.jit, static_argnames="config")
 def create_train_state(config: Config) -> TrainState:
-    """The state before the first step; one program, since operation by operation it takes 300 MB."""
+    """The state before the first step; one program, because operation by operation it takes 300 MB."""
     key = jax.random.fold_in(jax.random.key(config.train.seed), _INIT)
     variables = init_variables(key, config.model)
     optimizer = create_optimizer(config.train).init(variables["params"])
@@ -125,7 +126,7 @@ def draw_batch(step: Int[Array, ""], shapes: Float[Array, "s p 3"], config: Conf
 def train_step(
     state: TrainState, shapes: Float[Array, "s p 3"], *, config: Config
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-    """One optimiser step on fresh pairs, and what there is to log about it."""
+    """One optimiser step on fresh pairs, and what to log about it."""
     pairs = draw_batch(state.step, shapes, config)
     params, statistics = state.variables["params"], state.variables["batch_stats"]
     (loss, (terms, statistics)), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
@@ -133,7 +134,7 @@ def train_step(
     )
     updates, optimizer = create_optimizer(config.train).update(gradient, state.optimizer, params)
     variables = {"params": optax.apply_updates(params, updates), "batch_stats": statistics}
-    # A young average follows faster, so that it does not remember the initial weights for long.
+    # A young average follows faster, so it soon forgets the initial weights.
     decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
     average = optax.incremental_update(variables, state.average, 1 - decay)
     logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms}
@@ -173,17 +174,18 @@ def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[s
 
 
 def train(config: Config, workdir: str | Path, *, root: str | Path | None = None) -> Variables:
-    """Train, or go on training, in `workdir`; returns the best variables by validation error.
+    """Train in `workdir`, resuming any run there; returns the variables of lowest validation error.
 
-    Writes `metrics.jsonl` (one object a line), the newest and the best checkpoint. The error that
-    chooses is the mean geodesic rotation error of the validation pairs, which are made from shapes
-    that are not trained on. A run that was stopped goes on from its last validation; one that was
-    stopped before the first has nothing to lose and starts anew, with any configuration.
+    Writes `metrics.jsonl` (one object per line), the latest and the best checkpoint. The best has
+    the lowest mean geodesic rotation error on the validation pairs, which are made from shapes that
+    are not trained on. A run that was stopped goes on from its last validation; one stopped before
+    its first validation starts over, with any configuration.
 
     Raises:
-      ValueError: `config.train` holds a number that makes no sense, `workdir` cannot be written to,
-        the data is missing, or `workdir` holds a run of another configuration.
-      FloatingPointError: the loss is not finite; says at which step. What was saved stays.
+      ValueError: `config.train` has a number out of range, `workdir` cannot be written to, the data
+        is missing, or `workdir` contains a run with another configuration.
+      FloatingPointError: the loss is not finite; the message says at which step. Saved checkpoints
+        stay.
     """
     _check_options(config.train)
     checkpoint.check_place(workdir)
@@ -222,7 +224,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
 
 
 _LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
-"""The smallest sensible value of these settings; the others must not be negative."""
+"""The smallest allowed value of these settings; the others must not be negative."""
 _POSITIVE = ("learning_rate", "clip")
 
 
@@ -236,7 +238,7 @@ def _check_options(config: TrainConfig) -> None:
         if name != "clip" and isinstance(value, float):
             bound += " and at most 1" if name == "ema" else " and finite"
         raise ValueError(
-            f"train.{name} must be {bound}, got {value}: correct it in the configuration file or by "
+            f"train.{name} must be {bound}, got {value}: correct it in the configuration file or with "
             f"--train.{name.replace('_', '-')}."
         )
 
@@ -249,14 +251,14 @@ def release(
     directory: str | Path = "",
     root: str | Path | None = None,
 ) -> Path:
-    """Write the best weights of a run into `directory` (the workdir), with a card of their making.
+    """Write the best weights of a run into `directory` (the workdir), with a card of their origin.
 
-    The data is called by what is found in `root`, so that a stand-in is not taken for the original.
+    The data is named after what is found in `root`, so a stand-in does not pass for the original.
     Returns the path of the card.
 
     Raises:
-      ValueError: `name` is not a plain one or is taken, `workdir` holds no checkpoint, or its log
-        lacks the step of the best one.
+      ValueError: `name` is not plain or is taken, `workdir` has no checkpoint, or its log lacks the
+        step of the best one.
     """
     directory = directory or workdir
     check_new_name(name, directory)
@@ -265,10 +267,10 @@ def release(
     metrics = read_metrics(log)
     rows = np.flatnonzero(metrics["step"] == step)
     if len(rows) == 0:
-        # A run that is killed between the two has saved the step and not logged it.
+        # A run killed between the two has saved the step but not logged it.
         raise ValueError(
-            f"{log} lacks step {step}, that of the best checkpoint: let the command of train.py that "
-            "made the run finish."
+            f"{log} lacks step {step}, that of the best checkpoint: run `jaxreg train` with this "
+            "--workdir again to finish it."
         )
     card = {
         "command": command,

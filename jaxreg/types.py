@@ -1,4 +1,4 @@
-"""The records that every room passes around, and the convention of a transform, said once.
+"""The records that all packages share, and the convention for transforms.
 
 A transform maps *source* to *reference*: ``y = R x + t`` for a column vector ``x``; a cloud
 ``(n, 3)`` is mapped by ``points @ R.T + t``. Angles are radians; a name that ends in ``_deg`` is in
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 class RigidTransform(NamedTuple):
     """A rotation and a translation that map source to reference, ``y = R x + t``.
 
-    JAX or numpy arrays. With leading axes there are many, one for every index of them.
+    JAX or numpy arrays. Leading axes, if any, index many transforms.
     """
 
     rotation: Float[Any, "*b 3 3"]
@@ -21,14 +21,14 @@ class RigidTransform(NamedTuple):
 
 
 class PointCloud(NamedTuple):
-    """A padded cloud: rows of `points` where `mask` is False are padding and may hold anything."""
+    """A padded cloud: rows where `mask` is False are padding and may contain anything, even NaN."""
 
     points: Float[Array, "n 3"]
     mask: Bool[Array, "n"]
 
 
 class Pair(NamedTuple):
-    """Two clouds to register and the transform from source to reference (known when synthesised)."""
+    """Two clouds to register, and their transform (known if both were made from one shape)."""
 
     source: PointCloud
     reference: PointCloud
@@ -40,8 +40,8 @@ class Registration(NamedTuple):
 
     `transformation` is the 4x4 form of (`rotation`, `translation`). `correspondences[i]` is the
     reference copy of source point `i` (Eq. 6), a weighted mean of reference points, and
-    `confidence[i]`, in [0, 1], its inlier confidence (Eq. 11). `valid` is False when a cloud had no
-    point to work with; the transform is then the identity.
+    `confidence[i]`, in [0, 1], its inlier confidence (Eq. 11). `valid` is False if a cloud had no
+    valid point; the transform is then the identity.
     """
 
     rotation: Float[Array, "3 3"]
@@ -62,10 +62,9 @@ class GlobalRegistration(NamedTuple):
 
     `transformation` is the 4x4 form of (`rotation`, `translation`). `correspondences[i]` is the
     reference point nearest to source point `i` under the pose, and `confidence[i]`, in [0, 1], is
-    ``exp(-d^2 / 2 w^2)`` of its distance d, with w the width at which the search takes two points
-    for the same surface. `score` is the plausibility of the pose, higher is better; only scores of
-    the same two clouds compare. `valid` is False when a cloud had no point to work with; the
-    transform is then the identity.
+    ``exp(-d^2 / 2 w^2)`` of its distance d, where w is the distance up to which the search treats
+    two points as one surface. `score`: higher is better; compare scores of the same two clouds
+    only. `valid` is False if a cloud had no valid point; the transform is then the identity.
     """
 
     rotation: Float[Array, "3 3"]
@@ -87,12 +86,12 @@ class Refinement(NamedTuple):
 
     `transformation` is the 4x4 form of (`rotation`, `translation`). `correspondences[i]` is the
     reference point nearest to source point `i` under the pose, and `confidence[i]`, in [0, 1], the
-    weight of that pair in the cost: 0 beyond the largest distance, outside the trim and for
-    padding.
+    weight of that pair in the cost: 0 beyond `max_correspondence_distance`, outside the trimmed
+    share, and for padding.
 
     `residual` is the weighted root mean square of the residuals that the method minimises, in the
-    unit of the clouds (0 without any pair), and `inliers` the number of source points whose pair is
-    within the largest distance and the trim. `information` is ``sum_i w_i J_i^T M_i J_i`` of these
+    unit of the clouds (0 without any pair), and `inliers` is the number of source points whose pair
+    is within that distance and that share. `information` is ``sum_i w_i J_i^T M_i J_i`` of these
     pairs for a small motion ``(omega, v)``, ``y -> exp(omega)(y - centre) + centre + v``: rotation
     (radians) first, then translation, in the unit of the clouds; `centre` is the centroid of the
     reference. `converged` is True when the last step was below the tolerance.

@@ -1,7 +1,7 @@
 """Breaks each kernel on purpose, in a copy: a named test must notice. Run by `make mutants`.
 
-A mutant that survives is a hole in the tests; one whose text is gone must be written anew. Words after
-the command choose the mutants of these modules: `python tests/mutants.py matching losses`.
+A mutant that survives is a hole in the tests; one whose text is gone must be written again. Words
+after the command choose the mutants of these modules: `python tests/mutants.py matching losses`.
 """
 
 import concurrent.futures
@@ -104,7 +104,7 @@ def main() -> None:
     ):
         survivors = 0
         if broken := first_failure(sorted({test_of(mutant) for mutant in chosen}), cache):
-            sys.exit(f"{broken} fails without a mutant: mend that first.")
+            sys.exit(f"{broken} fails without a mutant: fix that first.")
         for mutant, test in zip(
             chosen, pool.map(killer, chosen, [cache] * len(chosen)), strict=True
         ):

@@ -1,4 +1,4 @@
-"""What the compiler made of it: the traps of SPEED looked for in the program, not with a clock.
+"""What the compiler made of it: the traps of SPEED, searched for in the program, not with a clock.
 
 Every guard has a twin that must be caught, so that a change in how XLA writes its programs down
 cannot make the guards blind. The programs are compiled for the CPU.

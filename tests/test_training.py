@@ -285,7 +285,7 @@ def test_settings_at_the_end_of_their_range_are_taken():
 def test_a_workdir_that_is_a_file_is_refused_before_the_work(config, tmp_path, inside, monkeypatch):
     monkeypatch.setattr(training, "load_training", None)  # Reading the data would fail.
     (tmp_path / "README.md").write_text("text")
-    with pytest.raises(ValueError, match="README.md is a file: name a directory by --workdir"):
+    with pytest.raises(ValueError, match="README.md is a file: name a directory with --workdir"):
         training.train(config, tmp_path / "README.md" / inside)
 
 
@@ -325,7 +325,9 @@ def test_a_damaged_checkpoint_is_called_that(config, tmp_path):
     code = f"from jaxreg.weights import checkpoint; checkpoint.load_checkpoint({str(tmp_path)!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert re.search(r"ValueError: .*best cannot be read \(.*\): put a whole copy", done.stderr)
+    assert re.search(
+        r"ValueError: .*best cannot be read \(.*\): replace it with an intact copy", done.stderr
+    )
 
 
 def test_a_card_tells_the_command_the_data_and_the_best_step(config, tmp_path):
@@ -360,7 +362,7 @@ def test_a_log_without_the_best_step_is_an_error_that_says_so(config, tmp_path):
         run.log({"step": 1, "loss": 0.5})
     with pytest.raises(ValueError, match=r"metrics.jsonl lacks step 2.* finish"):
         training.release("mine", tmp_path / "run", "", directory=tmp_path / "weights")
-    with pytest.raises(ValueError, match="there are weights 'modelnet40' already"):
+    with pytest.raises(ValueError, match="weights 'modelnet40' already exist"):
         training.release("modelnet40", tmp_path / "run", "", directory=tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
 

@@ -1,6 +1,6 @@
-"""The command `jaxreg`: five programs, of which only the one that is called for is loaded.
+"""The command `jaxreg`: five programs; only the one that is called is loaded.
 
-Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted, 130 interrupted.
+Exit status: 0 success; 2 bad input; 3 finished, but do not trust the result; 130 interrupted.
 """
 
 import dataclasses
@@ -23,16 +23,16 @@ __all__ = ["main"]
 
 @dataclasses.dataclass(frozen=True)
 class _Train:
-    """Train a network on pairs that a configuration describes: jaxreg train CONFIG.toml ..."""
+    """Train a network as a configuration says: jaxreg train CONFIG.toml ..."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Evaluate:
-    """Evaluate a network or another method on such pairs: jaxreg evaluate CONFIG.toml ..."""
+    """Evaluate a network, or another method, on the same pairs: jaxreg evaluate CONFIG.toml ..."""
 
 
 _WITH_CONFIGURATION = ("train", "evaluate")
-"""Their options depend on the file that follows, so that they parse their own command lines."""
+"""These parse their own command lines, because their options depend on the file that follows."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -48,10 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
     command: Any = tyro.extras.subcommand_cli_from_dict(
         {"register": Register, "info": Info, "view": View, "train": _Train, "evaluate": _Evaluate},
         prog="jaxreg",
-        description="Rigid registration of point clouds (jaxreg --version tells which).",
+        description="Rigid registration of point clouds (jaxreg --version prints the version).",
         args=given,
     )
-    # Tracing makes a million small objects and no garbage worth a search: a tenth of a short run.
+    # Tracing makes a million small objects and little garbage: collecting is a tenth of a short run.
     gc.disable()
     try:
         return status_of(command.run)

@@ -1,9 +1,9 @@
 """Evaluate: `jaxreg evaluate CONFIG.toml [--checkpoint DIR | --method NAME | --transforms FILE]`.
 
-Without any of them the released weights that the configuration (or --weights) names are evaluated.
-Every method meets the same pairs and the same metrics, in float64 from transforms. The pairs are those
-of [data] and [test_pairs]; a network keeps all that it was trained with but its iterations, n_inliers
-and robust_rounds. An option that would change nothing is refused.
+Without any of these, the weights named by the configuration or --weights are evaluated. Every
+method sees the same pairs; errors are computed in float64 from the transforms. The pairs are those
+of [data] and [test_pairs]; a network keeps the settings it was trained with, except iterations,
+n_inliers and robust_rounds. Options without effect are refused.
 """
 
 import dataclasses
@@ -30,40 +30,40 @@ _SUFFIXES = {
     "save_pairs": (".npz",),
     "picture": (".png", ".pdf", ".svg"),
 }
-"""The options that name an output, and how its name must end."""
+"""The options that name an output file, and the suffixes it may have."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What evaluate.py takes."""
+    """Options of `jaxreg evaluate`."""
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     checkpoint: str = ""
-    """Working directory of a run of train.py; its best checkpoint is evaluated, with the iterations and
-    n_inliers of the run unless the command line gives others."""
+    """Working directory of a training run; its best checkpoint is evaluated, with the iterations
+    and n_inliers of the run unless the command line gives others."""
     rienet: str = ""
-    """NPZ file with RIENet's released weights (not ours to ship)."""
+    """NPZ file with RIENet's published weights (not included)."""
     method: str = ""
-    """Another method: register, register_global, register_global_learned, icp, identity, or a baseline
-    such as open3d_fgr (a wrong name lists all there are)."""
+    """Another method: register, register_global, register_global_learned, icp, identity, or a
+    baseline such as open3d_fgr (a wrong name lists them all)."""
     transforms: str = ""
-    """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, by any program."""
+    """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, from any program."""
     refine: str = ""
-    """Refine the poses of the method on the clouds afterwards: icp, point_to_plane or gicp."""
+    """Refine the resulting poses on the clouds: icp, point_to_plane or gicp."""
     pairs: int = 0
-    """Evaluate the first N pairs only; 0 is all."""
+    """Evaluate only the first N pairs; 0 means all."""
     batch: int = 8
-    """Pairs registered at once."""
+    """Pairs per batch."""
     json: str = ""
-    """Write the figures to this file."""
+    """Write the results to this file."""
     picture: str = ""
-    """Draw the first pair before and after, as it was evaluated, to this file (PNG, PDF or SVG)."""
+    """Draw the first pair, before and after, to this file (PNG, PDF or SVG)."""
     save_pairs: str = ""
-    """Write the pairs to this NPZ file, for --transforms by another program."""
+    """Write the pairs to this NPZ file, for another program to register (see --transforms)."""
     save_transforms: str = ""
     """Write the predicted transforms to this NPZ file."""
     data_root: str = ""
-    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -90,7 +90,7 @@ def _run(options: Options, path: Path, given: Collection[str]) -> int:
         pairs=options.pairs,
         batch=options.batch,
     )
-    # Whatever becomes of the one, by a pose that is none or a full disk: minutes of work are here.
+    # Written even if the other fails, for a bad pose or a full disk: they hold minutes of work.
     try:
         _report(options, path, scored)
     finally:
@@ -99,7 +99,7 @@ def _run(options: Options, path: Path, given: Collection[str]) -> int:
 
 
 def _method(options: Options) -> str:
-    """The name, as of `methods.choose`, that the options give; empty where they give none."""
+    """The method that the options name, as `methods.choose` takes it; empty if they name none."""
     chosen = [
         options.method,
         options.checkpoint and f"checkpoint:{options.checkpoint}",
@@ -111,7 +111,7 @@ def _method(options: Options) -> str:
 
 
 def _check(options: Options, path: Path) -> None:
-    """What cannot be done is said before the work, not after it."""
+    """Refuse what cannot be done before the work, not after it."""
     if options.pairs < 0 or options.batch < 1:
         raise ValueError(
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
@@ -131,11 +131,11 @@ def _check(options: Options, path: Path) -> None:
 
 
 def _as_trained(options: Options, path: Path, given: Collection[str], method: str) -> Config:
-    """The configuration to evaluate with, after a word on what differs from the file at `path`.
+    """The configuration to evaluate with; prints what differs from the file at `path`.
 
-    What the file says of a network is what a training starts from; a run may have been made with other
-    options, and its network is evaluated as it was trained. Released weights follow the file, and so
-    do robust rounds, which belong to the pairs and not to the training.
+    The file says how a training starts; a run may have been made with other options, and its
+    network is evaluated as it was trained. Released weights follow the file, and so do robust
+    rounds, which belong to the pairs and not to the training.
     """
     config = options.config
     if not options.checkpoint:

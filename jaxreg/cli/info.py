@@ -1,4 +1,4 @@
-"""`jaxreg info`: what is in the file of a cloud."""
+"""`jaxreg info`: what a cloud's file contains."""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +18,7 @@ class Info:
     """PLY, PCD, text of points, PTX, E57, LAS/LAZ, NPY/NPZ, meshes (sampled); also packed (.gz)."""
 
     def run(self) -> int:
-        """Print a line for each property; returns the exit status."""
+        """Print one line per property; returns the exit status."""
         from jaxreg import io
         from jaxreg.scans import diagnosis, prepare
 

@@ -1,4 +1,4 @@
-"""What the commands share: configurations as arguments, exit statuses, and words on a terminal."""
+"""What the commands share: configurations as arguments, exit statuses, and terminal output."""
 
 import dataclasses
 import sys
@@ -51,8 +51,8 @@ def parse(
 def given_fields(options: type, arguments: list[str]) -> frozenset[str]:
     """The fields of the configuration that a command line sets after its file, as in `model.k`.
 
-    Parsed twice, from configurations that differ in every field: where the results agree, the command
-    line has spoken. Arguments as `parse` has accepted.
+    Parsed twice, from configurations that differ in every field: where the results agree, the
+    command line has set the field. The arguments must be ones that `parse` has accepted.
     """
     defaults = load_config(arguments[0])
     first, second = (
@@ -87,13 +87,13 @@ def _different(config: Any) -> Any:
         elif isinstance(value, bool):
             values[name] = not value
         else:
-            # Twice nothing or infinity is the same again.
+            # Doubling zero or infinity changes nothing.
             values[name] = next(x for x in (value * 2, _SOMETHING[type(value)]) if x != value)
     return type(config)(**values)
 
 
 def status_of(run: Callable[[], int], *, interrupted: str = "interrupted") -> int:
-    """The exit status of a command, whose mistakes are told in one line and not by a traceback."""
+    """The exit status of a command; its mistakes become one line instead of a traceback."""
     try:
         return run()
     except KeyboardInterrupt:
@@ -105,7 +105,7 @@ def status_of(run: Callable[[], int], *, interrupted: str = "interrupted") -> in
 
 
 def told(error: Exception) -> str:
-    """What an error says: of a file that could not be read or written, which one and why."""
+    """The text of an error; for a file that could not be read or written, which one and why."""
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return str(error)
@@ -129,17 +129,17 @@ def say(text: str) -> None:
 
 
 def line(name: str, value: str) -> None:
-    """A line with a name in front."""
+    """A line of the output that begins with a name."""
     say(f"{name:<16} {value}")
 
 
 def finite(points: np.ndarray, path: Path) -> np.ndarray:
-    """The finite points of the file `path`.
+    """The finite points of the file at `path`.
 
     Raises:
       ValueError: there are none.
     """
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
-        raise ValueError(f"{path}: no point is finite: export the file again.")
+        raise ValueError(f"{path} contains no finite point: export the file again.")
     return points

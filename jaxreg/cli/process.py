@@ -1,4 +1,4 @@
-"""The process of a command: a cache of programs on disk, and memory pages; no library may do this."""
+"""The process of a command: a program cache on disk, and memory pages; not for a library to set."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
 
     Used by the command line tools only; a library must not change a program's configuration. A cache
     that others could write to would run their code, so the directory is private (0700). Set
-    JAX_COMPILATION_CACHE_DIR to choose another. Where none can be made, nothing is kept.
+    JAX_COMPILATION_CACHE_DIR to choose another. If it cannot be made, nothing is kept.
     """
     if not cache_directory():
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -26,7 +26,7 @@ def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
 
 
 def cache_directory() -> str | None:
-    """Where JAX keeps compiled programs on disk; None where it keeps none."""
+    """The directory in which JAX keeps compiled programs; None if it keeps none."""
     return getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009 - a name made at run time
 
 
@@ -34,12 +34,12 @@ _HUGE_PAGES = "glibc.malloc.hugetlb"
 
 
 def restart_with_huge_pages() -> None:
-    """Start this program again with memory in pages of 2 MB, if it runs on Linux without them.
+    """Restart this program with memory pages of 2 MB, if it runs on Linux without them.
 
-    A training step works in half a gigabyte that XLA:CPU asks for anew each time; the kernel hands it
-    out in 130,000 pages of 4 KB, which takes an eighth of the step. The C library reads its setting
-    once, when a process starts. Called by train.py before anything else is done, and where
-    GLIBC_TUNABLES sets it either way nothing happens.
+    A training step works in half a gigabyte that XLA:CPU requests again each time; the kernel hands
+    it out in 130,000 pages of 4 KB, which takes an eighth of the step. The C library reads its
+    setting once, when a process starts. Called by train.py before anything else; does nothing if
+    GLIBC_TUNABLES already sets it either way.
     """
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if sys.platform == "linux" and _HUGE_PAGES not in tunables:

@@ -1,4 +1,4 @@
-"""`jaxreg register`: lay one scan on another, and say how far the result can be trusted."""
+"""`jaxreg register`: register one scan to another, and say whether to trust the result."""
 
 import contextlib
 import dataclasses
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 _CACHE_MISS = "/jax/compilation_cache/cache_misses"
 _COMPILING = (
     "compiling for clouds of these sizes, about 10 s; the programs are kept in\n"
-    "{directory}, so that later runs need not."
+    "{directory}, so later runs skip this."
 )
 _HINT = "look at it with --html PAGE.html"
 _START = "; a rough pose to start from helps: --initial T.txt"
 
 
 def _path(**options):
-    """An optional path; its default is not worth a word of the help."""
+    """An optional path; the help does not show its default."""
     return tyro.conf.arg(metavar="PATH", help_behavior_hint="", **options)
 
 
@@ -42,36 +42,36 @@ Degrees = Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior
 
 @dataclasses.dataclass(frozen=True)
 class Register:
-    """Lay one scan on another, say how far the result can be trusted, and write what is asked for.
+    """Register one scan to another, say whether to trust the result, and write the files asked for.
 
-    Exit status: 0 success, 2 bad input, 3 ran but the result is not to be trusted.
+    Exit status: 0 success; 2 bad input; 3 finished, but the result should not be trusted.
     """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
     """Cloud that moves: PLY, PCD, text of points, PTX, E57, LAS/LAZ, NPY/NPZ, or a mesh (PLY, STL, OBJ,
     OFF, GLB), which is sampled; also packed (.gz)."""
     reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
-    """Cloud that stays."""
+    """The cloud to align it with."""
     output: Output = None
     """Write the aligned source here (PLY, PCD, text and LAS keep colours and whatever else they hold; a
     mesh stays a mesh)."""
     json: OptionalPath = None
-    """Write transform, figures and verdict here (JSON)."""
+    """Write transform, numbers and verdict to this file (JSON)."""
     plot: OptionalPath = None
-    """Draw before and after from two sides here (PNG, PDF or SVG)."""
+    """Draw before and after, from two sides, to this file (PNG, PDF or SVG)."""
     html: OptionalPath = None
-    """Write a page with both clouds to turn here; it needs no network."""
+    """Write an interactive HTML page to this file; it works offline."""
     initial: OptionalPath = None
     """Start from this 4x4 matrix (text, NPY, or the JSON of an earlier run)."""
     max_rotation_deg: Degrees = None
-    """How far the clouds may be turned from each other (any angle if left out); settles symmetric
-    things."""
+    """Largest rotation between the scans in degrees (default: any); decides between the poses of
+    symmetric objects."""
     refine: Literal["gicp", "icp", "point_to_plane", "none"] = "gicp"
-    """Refinement of the pose that the search finds."""
+    """How to refine the pose that the search found."""
     nonfinite: Literal["raise", "drop"] = "raise"
     """What to do with points that are NaN or infinite."""
     config: tyro.conf.AvoidSubcommands[RegisterConfig] = RegisterConfig()
-    """Settings that the data usually choose well."""
+    """Settings; the defaults adapt to the data."""
 
     def run(self) -> int:
         """Register, write, print; returns the exit status."""
@@ -142,7 +142,8 @@ def _hints(source: np.ndarray, reference: np.ndarray, *, success: bool) -> list[
 
     clouds = {"source": source, "reference": reference}
     clouds = {name: p[np.isfinite(p).all(axis=1)] for name, p in clouds.items()}
-    hints = diagnosis.compared(clouds["source"], clouds["reference"])
+    least = 1.2 if success else 1.1
+    hints = diagnosis.compared(clouds["source"], clouds["reference"], least=least)
     if not success:
         for name, points in clouds.items():
             hints += [f"the {name}: {told}" for told in diagnosis.findings(points)]
@@ -154,7 +155,7 @@ def _outputs(command: Register) -> list[Path]:
 
 
 def _check_outputs(command: Register) -> None:
-    """What cannot be written is said before the work, not after it."""
+    """Refuse what cannot be written before the work, not after it."""
     from jaxreg import io
 
     if command.output:
@@ -231,7 +232,7 @@ def _write_json(path: Path, command: Register, result: "ScanRegistration") -> No
 
 @contextlib.contextmanager
 def _patience() -> Iterator[None]:
-    """A spinner on a terminal; and once, where a program is not on disk yet, a word about that."""
+    """A spinner on a terminal; and one message when a program must first be compiled."""
     from jax import monitoring
 
     process.enable_compilation_cache(least_seconds=0.0)

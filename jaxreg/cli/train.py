@@ -1,8 +1,8 @@
 """Train a network: `jaxreg train CONFIG.toml --workdir DIR [--section.field value ...]`.
 
-CONFIG.toml is a file of yours or the name of one that comes with jaxreg (a wrong name lists them).
-Run again with the same workdir to resume. Writes metrics.jsonl, curves.png, the newest and the best
-checkpoint by validation error.
+CONFIG.toml is your own file or the name of one that comes with jaxreg (a wrong name lists them).
+Run again with the same --workdir to resume. Writes metrics.jsonl, curves.png, the latest checkpoint
+and the one with the lowest validation error.
 """
 
 import dataclasses
@@ -23,28 +23,28 @@ from jaxreg.weights.released import check_new_name
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What `jaxreg train` takes."""
+    """Options of `jaxreg train`."""
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     workdir: str = ""
-    """Directory of the run (runs/CONFIG if left out); one that holds a run is resumed."""
+    """Directory of the run (runs/CONFIG if left out); an existing run is resumed."""
     release: str = ""
     """Write the best weights under this new name, with a card of how they were made."""
     release_to: str = ""
     """Directory to write them to (the workdir if left out); `jaxreg.load_pretrained` takes
-    DIRECTORY/NAME, or NAME where $JAXREG_WEIGHTS names the directory."""
+    DIRECTORY/NAME, or just NAME if $JAXREG_WEIGHTS is that directory."""
     data_root: str = ""
-    """Folder of the data sets (else $JAXREG_DATA, else data/ beside the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Parse, train, say where the results are; returns the exit status."""
+    """Parse, train, print where the results are; returns the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     path, options = parse(Options, description=__doc__, arguments=arguments, program="jaxreg train")
     command = shlex.join(["jaxreg", "train", *arguments])
     return status_of(
         lambda: _run(options, path, command),
-        interrupted="interrupted: the same command goes on from the last validation",
+        interrupted="interrupted: run the same command to go on from the last validation",
     )
 
 
@@ -62,14 +62,14 @@ def _run(options: Options, path: Path, command: str) -> int:
             card = release(options.release, workdir, command, root=root, directory=place)
             say(f"weights and card: {card.with_suffix('')}")
     except (ValueError, OSError) as error:
-        rest = f"({workdir} holds the whole run: the same command does the rest)"
+        rest = f"({workdir} has the whole run: run the same command again to do the rest)"
         raise ValueError(f"{told(error)} {rest}") from error
     say(f"best checkpoint, metrics.jsonl{drawn}: {workdir}")
     return SUCCESS
 
 
 def _draw_curves(workdir: str) -> str:
-    """Draw curves.png where there is matplotlib, which training can do without."""
+    """Draw curves.png if matplotlib is installed; training does not need it."""
     try:
         from jaxreg.view.pictures import plot_curves
     except ImportError as error:

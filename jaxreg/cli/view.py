@@ -1,4 +1,4 @@
-"""`jaxreg view`: a page with clouds to turn."""
+"""`jaxreg view`: an interactive page of clouds."""
 
 import dataclasses
 import webbrowser
@@ -12,22 +12,22 @@ from jaxreg.cli.options import SUCCESS, finite, line
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Write a page with clouds to turn; it needs no network."""
+    """Write an interactive HTML page of one or more clouds; it works offline."""
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE...")]
-    """Clouds in one frame."""
+    """The clouds, all in one frame."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("view.html")
-    """The page."""
+    """Write the page to this file."""
     open: bool = False
     """Open it in the browser."""
 
     def run(self) -> int:
-        """Write the page and say where; returns the exit status."""
+        """Write the page and print where it is; returns the exit status."""
         from jaxreg import io
         from jaxreg.view import page
 
         if not self.files:
-            raise ValueError("no file to view: name at least one.")
+            raise ValueError("no file given: name at least one.")
         io.check_place(self.output, self.files)
         clouds = {str(path): finite(io.read_cloud(path), path) for path in self.files}
         with io.whole(self.output) as part:

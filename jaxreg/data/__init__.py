@@ -1,4 +1,4 @@
-"""Shapes to make pairs from: the one way in to every source of data."""
+"""Shapes to make pairs from: the one entry to every source of data."""
 
 import dataclasses
 import os
@@ -27,7 +27,7 @@ __all__ = [
 
 Split = Literal["train", "validation", "test"]
 _ANY_POINTS = ("folder", "seven_scenes")
-"""Sources of files that are resampled to as many points as are asked for."""
+"""Sources whose files are resampled to the number of points asked for."""
 
 
 def data_root(
@@ -35,8 +35,9 @@ def data_root(
 ) -> Path | None:
     """The folder of the data sets: `argument` (--data-root), else $JAXREG_DATA, else data/.
 
-    data/ is looked for beside the configuration file, and in the working directory for one that comes
-    with jaxreg. None if there is no such folder and nothing else was asked for.
+    data/ is searched for next to the configuration file, or in the working directory for a
+    configuration that comes with jaxreg. None if there is no such folder and nothing else was asked
+    for.
 
     Raises:
       ValueError: the folder that `argument` or $JAXREG_DATA names does not exist.
@@ -47,7 +48,9 @@ def data_root(
     ):
         if named:
             if not Path(named).is_dir():
-                raise ValueError(f"{origin} names {named}, which is no folder: correct or drop it.")
+                raise ValueError(
+                    f"{origin} is {named}, which is not a folder: correct it or leave it out."
+                )
             return Path(named)
     beside = None if config_path is None else Path(config_path).parent / "data"
     return beside if beside is not None and beside.is_dir() else None
@@ -56,7 +59,7 @@ def data_root(
 def root_of(
     config: DataConfig, argument: str | Path | None, config_path: str | Path | None
 ) -> Path | None:
-    """`data_root` where the source that `config` names reads from it, else None."""
+    """`data_root` if the source that `config` names reads from it, else None."""
     return None if config.name in ("shapes", "folder") else data_root(argument, config_path)
 
 
@@ -71,9 +74,9 @@ def load_shapes(
     """Clouds (n, P, 3) float32 and labels (n,) int32 of the source that `config.name` names.
 
     `validation` is a share of the *training* shapes, chosen by `seed` and left out of `train`.
-    `points` is P where the source can choose (procedural shapes, resampled scans, files of one's
-    own); ModelNet40 and ICL-NUIM give the P of their files. `root` as of `data_root`; procedural
-    shapes and `config.folder` need none.
+    `points` is P if the source can choose (procedural shapes, resampled scans, your own files);
+    ModelNet40 and ICL-NUIM give the P of their files. `root` is what `data_root` returns;
+    procedural shapes and `config.folder` need none.
 
     Raises:
       ValueError: an unknown name or split, missing data (the message gives the layout and where it
@@ -100,8 +103,8 @@ def load_training(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The clouds of `load_shapes` for training and for validation, from one reading of the files.
 
-    Where the source can choose, they have `points` and `validation_points` points. Errors as
-    `load_shapes`.
+    If the source can choose, they have `points` and `validation_points` points. Raises what
+    `load_shapes` raises.
     """
 
     def load(split: Split, points: int) -> np.ndarray:
@@ -115,9 +118,9 @@ def load_training(
 
 
 def dataset_label(config: DataConfig, root: str | Path | None) -> str:
-    """What figures call the test data: `config.label`, else by what is found in `root`.
+    """Name of the test data in tables: `config.label`, else chosen from what is in `root`.
 
-    A stand-in is called one, so that its figures never pass for those of the published data.
+    A stand-in is labelled as one, so its results never pass for those of the published data.
 
     Raises:
       ValueError: the data is missing.
@@ -129,9 +132,9 @@ def dataset_label(config: DataConfig, root: str | Path | None) -> str:
 
 
 def training_label(config: DataConfig, root: str | Path | None) -> str:
-    """What a card calls the shapes trained on; `config.label` names those tested on.
+    """Name of the training shapes on a card; `config.label` names those tested on.
 
-    Errors as `dataset_label`.
+    Raises what `dataset_label` raises.
     """
     match config.name:
         case "folder":
@@ -148,7 +151,7 @@ def training_label(config: DataConfig, root: str | Path | None) -> str:
 def _load_procedural(
     config: DataConfig, split: Split, points: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every split has a stream of its own, so validation takes nothing away from training."""
+    """Every split has its own stream, so validation takes nothing away from training."""
     counts = {
         "train": config.train_shapes,
         "validation": max(1, round(config.validation_share * config.train_shapes)),
@@ -170,10 +173,10 @@ def _load_files(
         )
     if root is None:
         raise ValueError(
-            f"data.name = '{config.name}' is read from files, and no folder is known: give "
-            "--data-root, set $JAXREG_DATA, make data/ beside the configuration file (in the working "
-            "directory for one that comes with jaxreg), or use data.name = 'shapes', which needs no "
-            "file."
+            f"data.name = '{config.name}' needs files, and their folder is not known: give "
+            "--data-root, set $JAXREG_DATA, or create data/ next to the configuration file (in the "
+            "working directory for one that comes with jaxreg). data.name = 'shapes' needs no "
+            "files."
         )
     if config.name == "modelnet40":
         categories = config.train_categories if split == "train" else config.test_categories
@@ -194,7 +197,7 @@ def _load_files(
 
 def _held_out_rows(config: DataConfig, count: int, seed: int) -> np.ndarray:
     """Which of `count` training clouds are for validation."""
-    # By fragment, so that no draw of a validated fragment is trained on.
+    # By fragment, so no draw of a validated fragment is trained on.
     draws = config.train_draws if config.name == "seven_scenes" else 1
     return np.repeat(_held_out(count // draws, config.validation_share, seed), draws)
 

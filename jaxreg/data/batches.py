@@ -1,4 +1,4 @@
-"""Streams of pairs in batches of one size: made from shapes, or given by a data set."""
+"""Streams of pairs in batches of equal size: made from shapes, or given by a data set."""
 
 from collections.abc import Iterator
 
@@ -36,10 +36,10 @@ _make_batch_jit = jax.jit(_make_batch, static_argnames="config")
 def pair_batches(
     shapes: Float[np.ndarray, "s p 3"], key: PRNGKeyArray, *, config: PairConfig, batch: int
 ) -> Iterator[tuple[Pair, int]]:
-    """One pair a shape, in batches; pair `i` depends on `key`, `i` and shape `i` only.
+    """One pair per shape, in batches; pair `i` depends on `key`, `i` and shape `i` only.
 
-    Every batch has the same size, so that nothing is compiled twice: the last is filled up with
-    pairs from the start. The number of pairs that count comes with each batch.
+    All batches have the same size, so nothing is compiled twice: the last is filled up with pairs
+    from the start. Each batch comes with the number of its pairs that count.
     """
     for start in range(0, len(shapes), batch):
         numbers = np.arange(start, start + batch) % len(shapes)
@@ -71,7 +71,7 @@ def given_pair_batches(
     config: PairConfig,
     batch: int,
 ) -> Iterator[tuple[Pair, int]]:
-    """As `pair_batches`, of given sources and references in the pose that `transforms` says."""
+    """As `pair_batches`, for given sources and references with the poses `transforms`."""
     source, target = clouds
     for start in range(0, len(source), batch):
         numbers = np.arange(start, start + batch) % len(source)

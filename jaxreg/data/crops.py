@@ -1,4 +1,4 @@
-"""Where a crop looks from, and the score of every point: the points of the largest score remain."""
+"""Where a crop looks from, and the score of every point: the points with the largest scores remain."""
 
 import jax
 import jax.numpy as jnp

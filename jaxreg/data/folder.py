@@ -1,8 +1,8 @@
-"""A folder of clouds of one's own: whatever files `jaxreg.io` reads, without a class to write.
+"""A folder of your own clouds: any files that `jaxreg.io` reads, with no class to write.
 
-With folders `train/` and `test/` in it these are the split. Without them the last files, in the
-order of their names, are for the test: scans that were taken one after the other show the same
-things, and a random split would test on what was trained on.
+Folders `train/` and `test/` in it are the split. Without them the last files, in the order of their
+names, are for the test: scans taken one after the other show the same things, and a random split
+would test on what was trained on.
 """
 
 import re
@@ -24,11 +24,11 @@ def load(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, points, 3) float32 and labels (n,) int32, the index of a file's own folder.
 
-    Of every file `points` distinct finite points are drawn without replacement, then moved and
+    `points` distinct finite points are drawn from every file without replacement, then moved and
     scaled as ModelNet40: zero mean, largest norm 1.
 
     Raises:
-      ValueError: no such folder, no file for the split, or a file that is malformed or holds fewer
+      ValueError: no such folder, no file for the split, or a file that is malformed or has fewer
         points; the message names it.
     """
     files = split_files(folder, split, test_share=test_share)
@@ -40,12 +40,12 @@ def load(
 def split_files(
     folder: str | Path, split: Literal["train", "test"], *, test_share: float
 ) -> list[Path]:
-    """The files of a split, folders within included, in the order of their names; errors as `load`.
+    """The files of a split, with subfolders, in the order of their names; raises what `load` raises.
 
     Numbers in names count as numbers: scan_9 comes before scan_10.
     """
     if folder == "":
-        raise ValueError("no folder is named: give yours by --data.folder.")
+        raise ValueError("no folder given: name yours with --data.folder.")
     folder = Path(folder)
     if (folder / "train").is_dir() and (folder / "test").is_dir():
         return _files(folder / split)
@@ -61,7 +61,7 @@ def split_files(
 
 def _files(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}: name yours by --data.folder.")
+        raise ValueError(f"there is no folder {folder}: name yours with --data.folder.")
     files = [path for path in folder.rglob("*") if path.suffix.lower() in io.READABLE]
     if not files:
         raise ValueError(f"no cloud in {folder}: expected files {', '.join(io.READABLE)}.")
@@ -78,8 +78,8 @@ def _drawn(path: Path, points: int, seed: tuple[int, int]) -> np.ndarray:
     cloud = np.unique(cloud[np.isfinite(cloud).all(axis=1)], axis=0)
     if len(cloud) < points:
         raise ValueError(
-            f"{path} holds {len(cloud)} distinct points, and the pairs are made from {points}: "
-            "choose fewer by --pairs.points and --test-pairs.points, or remove the file."
+            f"{path} has {len(cloud)} distinct points, but pairs need {points}: "
+            "set --pairs.points and --test-pairs.points lower, or remove the file."
         )
     cloud = cloud - cloud.mean(axis=0)
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""One data set of an HDF5 file, read whole and checked: every fault is one `ValueError`."""
+"""One data set of an HDF5 file, read whole and checked: every fault is a `ValueError`."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ def read(path: Path, key: str) -> np.ndarray:
     """The array under `key`.
 
     Raises:
-      ValueError: the file is missing, not HDF5 or truncated, or holds no array under `key`.
+      ValueError: the file is missing, not HDF5 or truncated, or has no array under `key`.
     """
     with extra("train", f"{path}: HDF5"):
         import h5py
@@ -22,13 +22,13 @@ def read(path: Path, key: str) -> np.ndarray:
             item = file.get(key)
             if not isinstance(item, h5py.Dataset):
                 raise ValueError(
-                    f"{path} has no array '{key}' among its keys {sorted(file)}: is it a file of "
+                    f"{path} has no array '{key}' among its keys {sorted(file)}: is it a file from "
                     "this data set?"
                 )
             return np.asarray(item[()])
     except OSError as error:
         raise ValueError(
-            f"{path} cannot be read as HDF5 ({error}): it is truncated or of another kind; "
+            f"{path} cannot be read as HDF5 ({error}): it is truncated or not HDF5; "
             "download it again."
         ) from None
 
@@ -49,7 +49,7 @@ def read_clouds(path: Path, key: str) -> np.ndarray:
     if not finite.all():
         row, point = np.argwhere(~finite)[0][:2]
         raise ValueError(
-            f"{path}: '{key}' holds a non-finite number in row {row}, point {point}: "
+            f"{path}: '{key}' has a non-finite number in row {row}, point {point}: "
             "download the file again, or leave that row out."
         )
     return clouds.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Augmented ICL-NUIM as published in HDF5: indoor scans in metres, any number of points a cloud."""
+"""Augmented ICL-NUIM as published in HDF5: indoor scans in metres, any number of points per cloud."""
 
 from pathlib import Path
 from typing import Literal
@@ -15,7 +15,7 @@ SOURCE = (
     "Augmented ICL-NUIM (http://redwood-data.org/indoor/dataset.html), in the HDF5 form of DeepGMR "
     "(https://github.com/wentaoyuan/deepgmr)"
 )
-_ORTHONORMAL = 1e-3  # Of a rotation in the file, largest entry of R^T R - I.
+_ORTHONORMAL = 1e-3  # Largest entry of R^T R - I for a rotation in the file.
 
 
 def load(root: str | Path, split: Literal["train", "test"]) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +36,7 @@ def load(root: str | Path, split: Literal["train", "test"]) -> tuple[np.ndarray,
 def load_pairs(root: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The test pairs: sources and references (n, P, 3) float32, transforms (n, 4, 4) float64.
 
-    ``reference = R source + t``, up to the sampling of the surfaces.
+    ``reference = R source + t``, apart from the sampling of the surfaces.
 
     Raises:
       ValueError: as `load`, or the transforms are not n rigid ones.
@@ -61,10 +61,10 @@ def load_pairs(root: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def label(root: str | Path) -> str:
-    """What figures on the test data found in `root` are to be called: the name of its folder.
+    """Name in tables of the test data found in `root`: that of its folder.
 
-    A set in the form of ICL-NUIM that is not ICL-NUIM is told apart by the folder it came in; files
-    that lie in `root` itself are taken for ICL-NUIM.
+    Another set in the form of ICL-NUIM goes by the folder that it came in; files in `root` itself
+    are taken for ICL-NUIM.
     """
     folder = find_file(root, "test").parent.parent
     return "icl_nuim" if folder == Path(root) else folder.name

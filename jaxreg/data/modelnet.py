@@ -1,4 +1,4 @@
-"""ModelNet40 as published in HDF5: 40 categories, official split, any number of points a shape."""
+"""ModelNet40 as published in HDF5: 40 categories, official split, any number of points per shape."""
 
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -30,7 +30,7 @@ def find_folder(root: str | Path) -> Path:
     if not found:
         raise ValueError(
             f"no ModelNet40 in {root}: expected {LAYOUT}. It is published at {URL}; "
-            "unzip it there, or give its folder by --data-root or $JAXREG_DATA."
+            "unzip it there, or give its folder with --data-root or $JAXREG_DATA."
         )
     return max(found, key=lambda path: path.name.endswith("_2048"))
 
@@ -40,8 +40,8 @@ def load(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, P, 3) float32, zero mean in the unit sphere, and labels (n,) int32.
 
-    The shapes stand in the order of the files in `{split}_files.txt`, the points in the order of
-    the files. `first20` keeps labels below 20, `last20` the others.
+    The shapes are in the order of `{split}_files.txt`, their points in the order of the files.
+    `first20` keeps labels below 20, `last20` the others.
 
     Raises:
       ValueError: no data set (see `find_folder`), an unknown split, or a file that is missing or
@@ -55,7 +55,7 @@ def load(
     sizes = {clouds.shape[1] for clouds, _ in parts}
     if len(sizes) > 1:
         raise ValueError(
-            f"{folder}: the {split} files hold shapes of {sorted(sizes)} points: they come from "
+            f"{folder}: the {split} files have shapes of {sorted(sizes)} points: they come from "
             "different releases; download one of them again."
         )
     clouds, labels = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -64,7 +64,7 @@ def load(
 
 
 def category_names(root: str | Path) -> tuple[str, ...]:
-    """The name of every label, from `shape_names.txt`; errors as `load`."""
+    """The name of every label, from `shape_names.txt`; raises what `load` raises."""
     return tuple(_lines(find_folder(root) / "shape_names.txt"))
 
 
@@ -79,7 +79,7 @@ def _chosen(labels: np.ndarray, categories: Categories) -> np.ndarray:
 
 
 def _listed(folder: Path, split: str) -> list[Path]:
-    """The files of a split; the list gives them under the path of the machine that wrote it."""
+    """The files of a split; the list has their paths on the machine that wrote it."""
     return [folder / PurePosixPath(line).name for line in _lines(folder / f"{split}_files.txt")]
 
 

@@ -1,8 +1,8 @@
-"""Two clouds to register, made from one shape, on device: a pure function of a key and a cloud.
+"""Make two clouds to register from one shape, on the device: a pure function of a key and a cloud.
 
 The order is: sample, move the reference, crop, shuffle, jitter, append outliers. Every stage draws
-from a key of its own, in float32, so that switching one stage on (outliers, say) changes nothing in
-the others, and the same key gives the same pair with and without 64-bit mode.
+from its own key, in float32. So switching one stage on (outliers, say) changes nothing in the
+others, and the same key gives the same pair with and without 64-bit mode.
 """
 
 from typing import NamedTuple
@@ -40,7 +40,7 @@ class _Keys(NamedTuple):
 
 
 def _split(key: PRNGKeyArray) -> _Keys:
-    """All keys by one split: every further one costs about 0.1 s of compilation."""
+    """All keys from one split: each additional split costs about 0.1 s of compilation."""
     keys = jax.random.split(key, 14)
     return _Keys(*keys[:4], source=_CloudKeys(*keys[4:9]), reference=_CloudKeys(*keys[9:]))
 
@@ -61,17 +61,17 @@ def make_pair(
     config: PairConfig,
     shape_mask: Bool[Array, "p"] | None = None,
 ) -> Pair:
-    """A source, a reference and the transform between them, ``reference = R source + t``.
+    """Make two clouds to register from one shape, and their transform, ``reference = R source + t``.
 
     `config` is static; vmap over keys and shapes for a batch. The masks are True everywhere unless
     `shape_mask` leaves fewer valid points than a cloud has rows: no crop prefers padding to a valid
-    point, and the rows are then valid points of the shape, padding, outliers, in this order.
+    point, and the rows are then valid points of the shape, padding and outliers, in this order.
 
-    Crops: `viewpoint` keeps the points nearest to one far viewpoint, the *same*
-    for both clouds although the reference has moved already, so the clouds overlap in part.
-    `half-space` keeps the points farthest along a random direction; a shared direction is fixed in
-    the source's frame and turns with the reference, so the same physical part remains in both
-    clouds. With `independent_crops` each cloud has a viewpoint or direction of its own.
+    Crops: `viewpoint` keeps the points nearest to one far viewpoint, the *same* for both clouds
+    although the reference has already moved, so the clouds overlap in part. `half-space` keeps the
+    points farthest along a random direction; a shared direction is fixed in the source's frame and
+    turns with the reference, so the same physical part remains in both clouds. With
+    `independent_crops` each cloud has its own viewpoint or direction.
 
     Raises:
       ValueError: the shape is not (p, 3), or the sizes do not fit: see `pair_sizes`.
@@ -93,9 +93,9 @@ def make_pair_from_scans(
     config: PairConfig,
     transform: RigidTransform | None = None,
 ) -> Pair:
-    """`make_pair` for two given clouds in one frame, such as two scans that are aligned already.
+    """`make_pair` for two given clouds in one frame, such as two scans that are already aligned.
 
-    The reference is moved by `transform`, or by a drawn one. `points` and `sampling` are not used:
+    The reference is moved by `transform`, or by a random one. `points` and `sampling` are not used:
     all points go to the crop.
 
     Raises:
@@ -134,7 +134,7 @@ def _kept(config: PairConfig, available: int) -> int:
         return available
     if not 1 <= config.kept <= available:
         raise ValueError(
-            f"kept = {config.kept} points cannot remain of the {available} that each cloud has "
+            f"kept = {config.kept}, but each cloud has {available} points "
             f"before the crop (sampling = '{config.sampling}'): choose 1 <= kept <= {available}, "
             "crop = 'none', or shapes with more points."
         )
@@ -186,7 +186,7 @@ def _draw_clouds(
         cloud = _take(shape, jnp.argsort(~shape.mask, stable=True)[:available])
         return cloud, cloud
     order = _shuffled(key, shape.mask)
-    # Every other rank of the order, so that the valid points of a padded shape are halved too.
+    # Every other rank of the order, so the valid points of a padded shape are halved too.
     return _take(shape, order[0::2][:available]), _take(shape, order[1::2][:available])
 
 
@@ -197,7 +197,7 @@ def _crop_scores(
     reference: PointCloud,
     config: PairConfig,
 ) -> tuple[Float[Array, "n"] | None, Float[Array, "m"] | None]:
-    """Which points a crop keeps: those of the largest score. `still` is the unmoved reference."""
+    """Which points a crop keeps: those with the largest scores. `still` is the unmoved reference."""
     if config.crop == "none":
         return None, None
     draw = crops.viewpoint if config.crop == "viewpoint" else crops.direction
@@ -223,7 +223,7 @@ def _finish(
 
 
 def _append_outliers(keys: _CloudKeys, cloud: PointCloud, count: int) -> PointCloud:
-    """`count` further points: random valid points of the cloud + N(0, 0.5), clipped to +-1."""
+    """`count` more points: random valid points of the cloud + N(0, 0.5), clipped to +-1."""
     valid = jnp.maximum(jnp.sum(cloud.mask, dtype=jnp.int32), 1)
     added = _take(cloud, jax.random.randint(keys.outlier_index, (count,), 0, valid, jnp.int32))
     points = added.points + _noise(keys.outlier_noise, added.points, _OUTLIER_STD, _OUTLIER_CLIP)
@@ -250,5 +250,5 @@ def _take(cloud: PointCloud, index: Int[Array, "m"]) -> PointCloud:
 
 
 def shape_points(pairs: PairConfig) -> int:
-    """Points that a shape must have, where its source can choose."""
+    """Points that a shape must have, if its source can choose."""
     return (2 if pairs.sampling == "disjoint" else 1) * pairs.points

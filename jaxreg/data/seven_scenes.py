@@ -1,8 +1,8 @@
 """7Scenes fragments as PLY files: real indoor scans, one scene (office) held out for the test.
 
-The standard split needs office. Where it is absent, `stand_in` holds out the last fragments of each
-scene that is present instead. Such fragments show the rooms that were trained on, in part even the
-same surfaces, so figures on them must be labelled and never stand beside the published ones.
+The standard split needs office. If it is absent, `stand_in` instead holds out the last fragments of
+each scene that is present. Such fragments show the rooms that were trained on, in part even the
+same surfaces, so results on them must be labelled and never listed next to the published ones.
 """
 
 import re
@@ -20,7 +20,7 @@ SOURCE = (
     "the 3DMatch benchmark's fragments (https://3dmatch.cs.princeton.edu), packed as 7scene/ by "
     "FMR (https://github.com/XiaoshuiHuang/fmr)"
 )
-_STAND_IN_SHARE = 0.2  # Of each scene's fragments, the last ones, at least one.
+_STAND_IN_SHARE = 0.2  # Share of each scene's fragments: the last ones, at least one.
 
 
 def find_scenes(root: str | Path) -> dict[str, list[Path]]:
@@ -40,7 +40,7 @@ def find_scenes(root: str | Path) -> dict[str, list[Path]]:
 
 
 def describe(root: str | Path) -> str:
-    """One sentence or two: the scenes found and absent, and what follows for the split."""
+    """One or two sentences: the scenes found and absent, and what that means for the split."""
     scenes = find_scenes(root)
     absent = [scene for scene in SCENES if scene not in scenes]
     text = f"7Scenes: found {', '.join(scenes)}"
@@ -51,13 +51,13 @@ def describe(root: str | Path) -> str:
         text += (
             f" Without the test scene {TEST_SCENE} only the stand-in split is possible: the last "
             f"{_STAND_IN_SHARE:.0%} of each scene's fragments are held out for the test. "
-            "Label its figures."
+            "Label its results."
         )
     return text
 
 
 def label(root: str | Path) -> str:
-    """What figures on the test data found in `root` are to be called."""
+    """Name in tables of the test data found in `root`."""
     scenes = find_scenes(root)
     if TEST_SCENE in scenes:
         return "seven_scenes"
@@ -75,10 +75,10 @@ def load(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds (n, points, 3) float32 and labels (n,) int32, the index of the scene in `SCENES`.
 
-    Each fragment is divided by its largest bounding-box side, freed of its mean and resampled
-    `draws` times, one after the other in the result: drawn without replacement, or with it where
-    the fragment is smaller. `train` is every scene
-    present but office, `test` is office; with `stand_in` see the head of this file.
+    Each fragment is divided by its largest bounding-box side, centred at its mean and resampled
+    `draws` times, one after the other in the result: without replacement, or with it if the
+    fragment is smaller. `train` is every scene present but office, `test` is office; for `stand_in`
+    see the head of this file.
 
     Raises:
       ValueError: an unknown split, no scene for it, or a malformed file (file, row, remedy).
@@ -92,7 +92,7 @@ def load(
 def split_files(
     root: str | Path, split: Literal["train", "test"], *, stand_in: bool = False
 ) -> list[tuple[str, Path]]:
-    """The scene and file of every fragment of a split; errors as `load`."""
+    """The scene and file of every fragment of a split; raises what `load` raises."""
     if split not in ("train", "test"):
         raise ValueError(f"7Scenes has the splits 'train' and 'test', got {split!r}.")
     scenes = find_scenes(root)
@@ -123,7 +123,7 @@ def read_fragment(path: Path) -> np.ndarray:
 
 
 def read_pose(path: Path) -> np.ndarray:
-    """The 4x4 camera-to-world pose in the info file beside the PLY file `path`.
+    """The 4x4 camera-to-world pose in the info file next to the PLY file `path`.
 
     Raises:
       ValueError: the info file is missing, or is not one line of text and a 4x4 matrix.
@@ -134,7 +134,7 @@ def read_pose(path: Path) -> np.ndarray:
         return np.array([line.split() for line in lines if line.strip()], float).reshape(4, 4)
     except (OSError, ValueError) as error:
         raise ValueError(
-            f"{info} must hold one line of text and a 4x4 pose ({error}): download it again."
+            f"{info} must contain one line of text and a 4x4 pose ({error}): download it again."
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""Every method by its name, and what each does with a batch of pairs or with two clouds.
+"""Every method by its name, and how it runs on a batch of pairs or on two clouds.
 
 `choose` is the one way from a name to a method: evaluation and every benchmark go through it.
 """
@@ -28,11 +28,11 @@ from jaxreg.weights.checkpoint import best_config, load_checkpoint
 from jaxreg.weights.released import available_weights, load_pretrained
 
 Batch = Callable[[Pair], RigidTransform]
-"""A batch of pairs (a leading axis on every array) to the stacked transforms; the true ones in it
-must not be read."""
+"""From a batch of pairs (a leading axis on every array) to the stacked transforms; it must not read
+the true ones in the batch."""
 
 BatchRefinement = Callable[[Pair, RigidTransform], RigidTransform]
-"""Better poses of a batch from given ones."""
+"""From a batch and given poses to better ones."""
 
 AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
 """Fields of the model that cost nothing to change after training."""
@@ -41,7 +41,7 @@ _OWN = ("identity", "icp", "register", "register_global", "register_global_learn
 
 
 class Outcome(NamedTuple):
-    """A pose (numpy), and for a method that judges itself whether to trust it and how far."""
+    """A pose (numpy) and, for a method that judges itself, whether and how far to trust it."""
 
     transform: RigidTransform
     success: bool | None = None
@@ -49,31 +49,31 @@ class Outcome(NamedTuple):
 
 
 class Method(NamedTuple):
-    """One method in its two forms: of a batch, and of two clouds (n, 3), (m, 3) in numpy."""
+    """One method in its two forms: for a batch, and for two clouds (n, 3), (m, 3) in numpy."""
 
     batch: Batch
     clouds: Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]], Outcome]
 
 
 def names() -> tuple[str, ...]:
-    """What `choose` takes; FILE and DIR stand for a path."""
+    """The names that `choose` takes; FILE and DIR stand for a path."""
     released = tuple(f"weights:{name}" for name in available_weights())
     return (*_OWN, *released, "rienet:FILE", "checkpoint:DIR", *baselines.NAMES)
 
 
 def choose(name: str, *, model: ModelConfig | None = None) -> Method:
-    """The method of a name, one of `names`.
+    """The method by its name, one of `names`.
 
-    `identity` does nothing. Of this library: `icp` (point to point, from where the clouds are),
+    `identity` does nothing. From this library: `icp` (point to point, from where the clouds are),
     `register` (with all its defaults), `register_global`, and `register_global_learned` (the same
     with its released features). Trained networks: released weights, RIENet's NPZ file, the best
-    checkpoint of a run; where `model` is given, its `AFTER_TRAINING` fields replace those of the
-    training. The rest are other people's (`jaxreg.evaluation.baselines`), also with the spacing of
-    the points, as in `open3d_fgr@0.02`.
+    checkpoint of a run; if `model` is given, its `AFTER_TRAINING` fields replace those of the
+    training. The rest are other people's (`jaxreg.evaluation.baselines`), optionally with the
+    spacing of the points, as in `open3d_fgr@0.02`.
 
     Raises:
-      ValueError: an unknown name (the message lists those there are), a file or weights that are not
-        there, or a library that is not installed.
+      ValueError: an unknown name (the message lists the known ones), a file or weights that do not
+        exist, or a library that is not installed.
     """
     match name:
         case "identity":
@@ -110,9 +110,9 @@ def load_network_of(name: str) -> tuple[Variables, Config]:
 
 
 def trained_config(name: str) -> Config | None:
-    """The configuration that the network of a name was trained with; None where it is no network.
+    """The configuration that a network was trained with, by its name; None if it is not a network.
 
-    Errors as `load_network_of`. Of a checkpoint the arrays are not read.
+    Raises what `load_network_of` raises. The arrays of a checkpoint are not read.
     """
     if not _is_network(name):
         return None
@@ -143,7 +143,7 @@ _register_batch_jit = jax.jit(_register_batch, static_argnames=("config", "padde
 
 
 def network_method(variables: Variables, config: ModelConfig) -> Batch:
-    """The trained network. A batch without padding runs a program of its own, a quarter quicker."""
+    """The trained network. A batch without padding runs a separate program, a quarter faster."""
 
     def method(pair: Pair) -> RigidTransform:
         padded = not all(np.all(cloud.mask) for cloud in (pair.source, pair.reference))
@@ -165,7 +165,7 @@ _IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 
 def identity_method(pair: Pair) -> RigidTransform:
-    """Doing nothing: the row that every method must beat."""
+    """Do nothing: the row that every method must beat."""
     batch = pair.source.mask.shape[0]
     return RigidTransform(np.tile(np.eye(3), (batch, 1, 1)), np.zeros((batch, 3)))
 

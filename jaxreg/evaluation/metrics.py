@@ -1,7 +1,7 @@
 """Errors of estimated transforms, in float64 on the host, from transforms and never from a model.
 
-Rotations are measured as they are given: nothing is projected onto SO(3) first, so that an estimate
-that is orthonormal only to float32 pays for it.
+Rotations are measured as given: nothing is projected onto SO(3) first, so an estimate that is
+orthonormal only to float32 pays for it.
 """
 
 import warnings
@@ -15,7 +15,7 @@ from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.types import RigidTransform
 
 _ORTHONORMAL = 1e-3
-"""Largest entry of |R^T R - I| that still counts as a rotation that lost digits in float32."""
+"""Largest entry of |R^T R - I| that still passes for a rotation that lost digits in float32."""
 
 
 class PairErrors(NamedTuple):
@@ -49,7 +49,7 @@ def pair_errors(predicted: RigidTransform, truth: RigidTransform) -> PairErrors:
 
     Raises:
       ValueError: the shapes differ or are not those of stacked transforms, there is no pair, or a
-        pair (the message names the first) is not finite or its rotation not a rotation.
+        pair (the message names the first) is not finite or its matrix is not a rotation.
     """
     predicted, truth = _checked(predicted, "predicted"), _checked(truth, "true")
     if len(predicted.rotation) != len(truth.rotation):
@@ -74,7 +74,7 @@ def summarize(errors: PairErrors) -> dict[str, int | float]:
       over the Euler angles and over the coordinates (the anisotropic metrics of DCP).
     * `mie_r_deg`, `mie_t`: mean angle and mean length (the isotropic metrics of RPMNet; the frame
       that the published MIE(t) rotates into, ``R_gt^T (t_pred - t_gt)``, changes no length).
-    * `mie_r_deg_float32_acos`: the published form of MIE(R), which says nothing below 0.02 degrees.
+    * `mie_r_deg_float32_acos`: the published form of MIE(R), meaningless below 0.02 degrees.
     * `recall_1deg`: share of pairs within 1 degree and 0.01; `recall_5deg`: 5 degrees and 0.1.
     * `worst_pair`, `worst_rre_deg`, `worst_rte`: the pair with the largest angle.
     """
@@ -111,8 +111,8 @@ def rotation_angle_deg_float32_acos(
 ) -> Float[np.ndarray, "n"]:
     """Angle between rotations in degrees as published, ``arccos((trace(R2^T R1) - 1) / 2)``.
 
-    Kept for comparison only. The float32 cosines nearest to 1 are 6e-8 apart, so that nothing
-    between 0 and 0.02 degrees can come out, and a rotation orthonormal to 1e-6 prints up to 0.1.
+    Kept for comparison only. The float32 cosines nearest to 1 are 6e-8 apart, so no result between
+    0 and 0.02 degrees is possible, and a rotation orthonormal to 1e-6 prints up to 0.1.
     """
     relative = np.swapaxes(other.astype(np.float32), -1, -2) @ rotation.astype(np.float32)
     cosine = (np.trace(relative, axis1=-2, axis2=-1) - np.float32(1)) / np.float32(2)
@@ -132,7 +132,7 @@ def _checked(transform: RigidTransform, name: str) -> RigidTransform:
     if not finite.all():
         raise ValueError(
             f"the {name} transform of pair {int(np.argmin(finite))} is not finite: give the "
-            "identity where a method failed, so that the failure counts."
+            "identity where a method failed, so the failure counts."
         )
     gram = np.swapaxes(rotation, 1, 2) @ rotation
     defect = np.abs(gram - np.eye(3)).max(axis=(1, 2))
@@ -140,7 +140,7 @@ def _checked(transform: RigidTransform, name: str) -> RigidTransform:
     if not proper.all():
         pair = int(np.argmin(proper))
         raise ValueError(
-            f"the {name} rotation of pair {pair} is no rotation: |R^T R - I| = {defect[pair]:.2g}, "
+            f"the {name} rotation of pair {pair} is not a rotation: |R^T R - I| = {defect[pair]:.2g}, "
             f"det R = {np.linalg.det(rotation[pair]):.3g}; project it onto SO(3) first."
         )
     return RigidTransform(rotation, translation)

@@ -20,10 +20,10 @@ def evaluate_method(
     *,
     initial: RigidTransform | None = None,
 ) -> tuple[RigidTransform, RigidTransform, float]:
-    """Predicted and true transforms (numpy, stacked), and the seconds that `method` takes a pair.
+    """Predicted and true transforms (numpy, stacked), and the seconds that `method` takes per pair.
 
     With `initial`, transforms of all pairs, the method (a `refinement`) also gets those of the batch.
-    The first batch is registered twice and not timed the first time, since it compiles.
+    The first batch is registered twice; the first time is not counted, because it compiles.
     """
     results, seconds, done = [], 0.0, 0
     for pair, count in batches:
@@ -38,7 +38,7 @@ def evaluate_method(
         predicted = jax.block_until_ready(method(*inputs))
         seconds += time.perf_counter() - begin
         done += pair.source.mask.shape[0]
-        # Copies: a numpy view would keep the array that it looks at alive on the device.
+        # Copies: a numpy view would keep its array alive on the device.
         results.append(
             jax.tree.map(lambda x, c=count: np.array(x)[:c], (predicted, pair.transform))
         )

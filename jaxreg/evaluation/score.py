@@ -1,6 +1,6 @@
-"""From a configuration and the name of a method to the figures of RESULTS.md.
+"""From a configuration and the name of a method to the numbers of RESULTS.md.
 
-Networks, classical methods and transforms that another program made meet the same pairs and the same
+Networks, classical methods and transforms from another program get the same pairs and the same
 metrics.
 """
 
@@ -28,7 +28,7 @@ _TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train
 
 
 class Scored(NamedTuple):
-    """What `evaluate` finds (numpy): stacked transforms, the first pair, and how they were made."""
+    """What `evaluate` returns (numpy): stacked transforms, the first pair, and how they were made."""
 
     method: str
     dataset: str
@@ -41,11 +41,11 @@ class Scored(NamedTuple):
 def pair_stream(
     config: Config, *, root: str | Path | None, pairs: int = 0, batch: int = 8
 ) -> tuple[int, Iterator[tuple[Pair, int]]]:
-    """The number of test pairs, and the pairs in batches; `pairs` takes the first so many.
+    """The number of test pairs, and the pairs in batches; `pairs` limits them to the first so many.
 
     Raises:
-      ValueError: the data is missing or malformed, it comes without pairs although `config` wants
-        those, or the sizes of the pairs do not fit it.
+      ValueError: the data is missing or malformed, it has no pairs although `config` asks for them,
+        or it does not suit the sizes of the pairs.
     """
     key = key_of_tests(config.data.test_seed)
     if config.data.test_pairs_from == "file":
@@ -87,13 +87,13 @@ def evaluate(
 ) -> Scored:
     """Evaluate one method on the test pairs of `config`.
 
-    `method` is a name of `methods.choose` (without one, that of the released weights that `config`
-    names), whose networks take `methods.AFTER_TRAINING` from `config.model`; or `transforms` is a file
-    of poses. `refine` (icp, point_to_plane or gicp; ten iterations without annealing, else the
+    `method` is a name for `methods.choose` (by default the released weights that `config` names);
+    networks take their `methods.AFTER_TRAINING` from `config.model`. Or `transforms` is a file of
+    poses. `refine` (icp, point_to_plane or gicp; ten iterations without annealing, else the
     defaults of `RefineConfig`) improves the poses on the clouds afterwards.
 
     Raises:
-      ValueError: both or neither of the two are known; an unknown method or refinement; missing
+      ValueError: both or neither of the two are given; an unknown method or refinement; missing
         data, weights or files.
     """
     name = _evaluated(config, method, transforms)
@@ -116,7 +116,7 @@ def evaluate(
 
 
 def _evaluated(config: Config, method: str, transforms: str) -> str:
-    """The name of what is to be evaluated; empty where transforms are given."""
+    """The name of what to evaluate; empty if transforms are given."""
     if method and transforms:
         raise ValueError(
             f"both a method ({method}) and transforms ({transforms}) are given: choose one of the two."
@@ -132,21 +132,21 @@ def _evaluated(config: Config, method: str, transforms: str) -> str:
 def check_given(
     config: Config, given: Collection[str], *, method: str = "", transforms: str = ""
 ) -> None:
-    """Refuse what was set to no effect, so that nobody takes figures for what they are not.
+    """Refuse settings without effect, so nobody takes the results for what they are not.
 
     `given` names the fields of `config` that somebody set, as in `model.k`; the rest is as in
     `evaluate`.
 
     Raises:
-      ValueError: one of them changes nothing; says why, and what to give instead.
+      ValueError: one of them has no effect; the message says why, and what to give instead.
     """
     for name in given:
         if reason := _without_effect(config, name, method, transforms):
-            raise ValueError(f"{option(config, name)} changes nothing here: {reason}.")
+            raise ValueError(f"{option(config, name)} has no effect here: {reason}.")
 
 
 def option(config: Config, name: str) -> str:
-    """How a command line sets a field to what it is, as in `--test-pairs.outliers 200`."""
+    """How a command line sets a field to its value, as in `--test-pairs.outliers 200`."""
     section, dot, field = name.rpartition(".")
     value = getattr(getattr(config, section) if section else config, field)
     section, field = section.replace("_", "-") + dot, re.sub(r"_(?!$)", "-", field)
@@ -157,11 +157,11 @@ def option(config: Config, name: str) -> str:
 
 
 def _without_effect(config: Config, name: str, method: str, transforms: str) -> str:
-    """Why setting a field changes no evaluation, and what to do; empty where it does."""
+    """Why setting a field has no effect on an evaluation, and what to do; empty if it has one."""
     section, _, field = name.rpartition(".")
     if section == "pairs":
         instead = option(config, name).replace("--", "--test-", 1)
-        return f"[pairs] are to train on; to test on such pairs give {instead}"
+        return f"[pairs] are for training; to test on such pairs give {instead}"
     if section in ("loss", "train") or (section == "data" and field in _TRAINING_DATA):
         return "it belongs to the training; leave it out, or train with it"
     if name == "weights" and (method or transforms):
@@ -181,7 +181,7 @@ def _without_effect(config: Config, name: str, method: str, transforms: str) -> 
 
 
 def figures(scored: Scored) -> dict[str, Any]:
-    """The metrics of an evaluation (`metrics.summarize`, degrees), and what it was of.
+    """The metrics of an evaluation (`metrics.summarize`, degrees), and what was evaluated.
 
     Raises:
       ValueError: a predicted transform is not finite or not a rotation.
@@ -206,8 +206,8 @@ def _refinement(name: str) -> methods.BatchRefinement | None:
         return None
     if name not in _REFINEMENTS:
         raise ValueError(f"no refinement '{name}': choose one of {', '.join(_REFINEMENTS)}.")
-    # From nearby: a kernel that starts ten times as wide, as for a pose that may be far off, has drawn
-    # the exact pose of a flight of stairs to the next step. Ten iterations end where thirty do.
+    # From nearby: a kernel that starts ten times as wide, as for a pose that may be far off, has
+    # pulled the exact pose of a flight of stairs to the next step. Ten iterations end where thirty do.
     return methods.refinement(RefineConfig(method=name, kernel_annealing=1.0, iterations=10))
 
 
@@ -245,7 +245,7 @@ def save_transforms(path: str | Path, transforms: RigidTransform) -> None:
 
 
 def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
-    # Opened here: to a name without .npz numpy would add it.
+    # Opened here: numpy would add .npz to a name without it.
     with Path(path).open("wb") as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 

@@ -1,4 +1,4 @@
-"""A table of results for people."""
+"""A table of results to read."""
 
 from collections.abc import Mapping, Sequence
 
@@ -24,10 +24,10 @@ _COLUMNS = {
 
 
 def results_table(results: Sequence[Result], *, title: str | None = None) -> Table:
-    """A table of results: one stands on its side (a row a metric), several are a row each.
+    """A table of results: a single one has one row per metric, several have one row each.
 
-    Metrics that no result has are left out. "As published" is MIE(R) by a float32 arccos, which
-    says nothing below 0.02 degrees.
+    Metrics that no result has are left out. "As published" is MIE(R) with a float32 arccos,
+    meaningless below 0.02 degrees.
     """
     present = [name for name in _COLUMNS if any(r.get(name) is not None for r in results)]
     labels = [str(r.get("method", "")) for r in results]

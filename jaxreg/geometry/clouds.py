@@ -1,4 +1,4 @@
-"""What users give: the one check of a cloud, of its normals and of a pose; padding to few sizes."""
+"""The one check of what users give (a cloud, its normals, a pose), and padding to a few sizes."""
 
 import contextlib
 import os
@@ -12,11 +12,11 @@ from jaxreg.geometry.rigid import nearest_rotation
 from jaxreg.types import RigidTransform
 
 _LARGEST = 1e100
-"""Coordinates beyond would overflow when squared."""
+"""Larger coordinates would overflow when squared."""
 
 
 _FEWEST = 3
-"""Two points leave a rotation about the line between them."""
+"""Two points leave the rotation about the line between them free."""
 
 
 def check_points(
@@ -44,8 +44,8 @@ def check_points(
     if nonfinite == "raise" and broken.any():
         row = int(np.argmax(broken))
         raise ValueError(
-            f"{name}: point {row} is {array[row].tolist()} and {np.sum(broken)} of {len(array)} "
-            "points are not finite: remove them, or pass nonfinite='drop'."
+            f"{name}: {np.sum(broken)} of {len(array)} points are not finite, the first is "
+            f"point {row}, {array[row].tolist()}: remove them, or pass nonfinite='drop'."
         )
     if finite.sum() < _FEWEST:
         raise ValueError(
@@ -63,19 +63,19 @@ def _reshaped(points: object, shape: tuple[int, ...]) -> str:
     """What is not (n, 3), and what makes it so."""
     table = ".to_numpy()" if hasattr(points, "to_numpy") else ""
     if len(shape) == 2 and shape[0] in (3, 4) and shape[1] > shape[0]:
-        part = "points.T" if shape[0] == 3 else "points.T[:, :3]"
-        return f"one point a column, not (n, 3): transpose it, as in {part.replace('.T', table + '.T')}"
+        part = f"points{table}.T" + ("" if shape[0] == 3 else "[:, :3]")
+        return f"one point per column, not (n, 3): transpose it, as in {part}"
     if len(shape) == 2 and shape[1] == 2:
         return (
             "not (n, 3): add a column, as in numpy.column_stack([points, numpy.zeros(len(points))])"
         )
     if len(shape) == 2 and shape[1] > 3:
-        return f"not (n, 3): give one point a row, x y z, as in points{table}[:, :3]"
+        return f"not (n, 3): give one point per row, x y z, as in points{table}[:, :3]"
     if len(shape) > 2 and shape[-1] == 3:
-        return "not (n, 3): give one point a row, as in points.reshape(-1, 3)"
+        return "not (n, 3): give one point per row, as in points.reshape(-1, 3)"
     if len(shape) > 2 and shape[-1] > 3:
-        return "not (n, 3): give one point a row, as in points[..., :3].reshape(-1, 3)"
-    return "not (n, 3): give one point a row, x y z"
+        return "not (n, 3): give one point per row, as in points[..., :3].reshape(-1, 3)"
+    return "not (n, 3): give one point per row, x y z"
 
 
 def _as_floats(points: object, name: str) -> np.ndarray:
@@ -99,7 +99,7 @@ def _as_floats(points: object, name: str) -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise ValueError(
-            f"{name} has dtype {array.dtype}: give real numbers, as in "
+            f"{name} has dtype {array.dtype}: give real numbers, for example "
             "numpy.asarray(points, numpy.float64)."
         )
     return array.astype(np.float64)
@@ -108,7 +108,7 @@ def _as_floats(points: object, name: str) -> np.ndarray:
 def check_normals(
     normals: object, kept: Bool[np.ndarray, "n"], name: str
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals of a cloud with one row for each of its own; a zero normal stays zero.
+    """Unit normals of a cloud, one row per row of the cloud; a zero normal stays zero.
 
     Raises:
       ValueError: not numeric, not of the shape of the cloud, or not finite where the cloud is.
@@ -130,7 +130,7 @@ def check_normals(
 
 
 def check_pose(pose: object, name: str) -> RigidTransform:
-    """A 4x4 matrix or a `RigidTransform` as a transform in float64 whose rotation is orthogonal.
+    """A 4x4 matrix or a `RigidTransform` as a float64 transform with an orthogonal rotation.
 
     Raises:
       ValueError: it is neither, or not finite, or not rigid.
@@ -140,11 +140,11 @@ def check_pose(pose: object, name: str) -> RigidTransform:
     else:
         rotation, translation = _parts_of_matrix(pose, name)
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        raise ValueError(f"{name} holds NaN or infinity: give a finite transform.")
+        raise ValueError(f"{name} contains NaN or infinity: give a finite transform.")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise ValueError(
-            f"{name} is not a rigid transform (its 3x3 part must be a rotation: orthogonal, "
-            "det +1): remove scale, shear and mirroring."
+            f"{name} is not a rigid transform (its 3x3 part must be orthogonal with "
+            "determinant +1): remove scale, shear and mirroring."
         )
     return RigidTransform(nearest_rotation(rotation), translation)
 
@@ -153,9 +153,7 @@ def _parts_of_matrix(pose: object, name: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         matrix = np.asarray(pose, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} is not an array of numbers: give a 4x4 matrix [[R, t], [0, 1]]."
-        ) from None
+        raise ValueError(f"{name} is not numeric: give a 4x4 matrix [[R, t], [0, 1]].") from None
     if matrix.shape != (4, 4):
         raise ValueError(f"{name} must be a 4x4 matrix [[R, t], [0, 1]], got {matrix.shape}.")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
@@ -176,7 +174,7 @@ def padded(
 
 
 def padded_size(count: int, *, smallest: int) -> int:
-    """The smallest of ``smallest * 2^k`` that holds `count`: every size compiles its own programs."""
+    """The smallest ``smallest * 2^k`` of at least `count`: every size compiles its own programs."""
     size = smallest
     while size < count:
         size *= 2

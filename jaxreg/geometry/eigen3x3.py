@@ -1,7 +1,7 @@
 """Symmetric 3x3 matrices, many at a time: eigenvectors and the inverse, elementwise.
 
-A cloud has one such matrix per point. LAPACK takes them one by one, and its calls have waited for
-XLA's thread pool forever on clouds of more than some 1500 points (jaxlib 0.10.2, two cores).
+A cloud has one such matrix per point. LAPACK takes them one by one, and on clouds of more than
+about 1500 points its calls have hung, waiting for XLA's thread pool (jaxlib 0.10.2, two cores).
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class Eigen(NamedTuple):
 def eigh(matrix: Float[Array, "*n 3 3"]) -> Eigen:
     """Eigenvalues and eigenvectors by cyclic Jacobi rotations (Golub and Van Loan, section 8.5).
 
-    Of the symmetric part ``(A + A^T) / 2``. Signs of the vectors are arbitrary.
+    They are those of the symmetric part ``(A + A^T) / 2``. Signs of the vectors are arbitrary.
 
     Differentiable: ``dl_k = v_k^T dA v_k`` and ``dv_k = sum_j v_j (v_j^T dA v_k) / (l_k - l_j)``
     over the eigenvalues ``l_j`` that differ from ``l_k`` by more than rounding.
@@ -35,7 +35,7 @@ def eigh(matrix: Float[Array, "*n 3 3"]) -> Eigen:
     matrix = (matrix + matrix.mT) / 2
     largest = jnp.max(jnp.abs(matrix), axis=(-2, -1))
     scale = jnp.where(largest > 0, largest, 1)
-    # An axis in front, over which the components of a column are spread.
+    # A leading axis, for the components of a column.
     entry = lambda p, q: (matrix[..., p, q] / scale)[None]  # noqa: E731
     diagonal, off = (tuple(entry(k, (k + d) % 3) for k in range(3)) for d in (0, 1))
     unit = jnp.eye(3, dtype=matrix.dtype)
@@ -75,10 +75,10 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _rotate(_, state: tuple) -> tuple:
-    """The rotation that makes the first entry beside the diagonal zero; then the axes take turns.
+    """The rotation that makes the first off-diagonal entry zero; then the axes are cycled.
 
-    `off` are the entries (0, 1), (1, 2) and (2, 0). Three rotations are a sweep, and put every axis
-    back into its place. (One rotation at a time is a third of the program to trace and compile.)
+    `off` are the entries (0, 1), (1, 2) and (2, 0). Three rotations are a sweep, and bring every
+    axis back to its place. (One rotation per step is a third as much program to trace and compile.)
     """
     (a, b, c), (ab, bc, ca), (u, v, w) = state
     # The smaller root of t^2 + t (b - a) / ab - 1, without a division by `ab`.

@@ -1,9 +1,9 @@
 """The frame that every solver works in: both clouds centred, lengths near 1.
 
 Solving at the original offset would lose the digits that the offset takes, and a damping or a step
-limit only means something when rotation and translation are of one size. `enter` is for arrays on a
+limit means something only if rotation and translation are of one size. `enter` is for arrays on a
 device; on the host `Frame` is made of the centres and radii of two clouds (`measure`), in float64.
-The unit is the same: the root mean square of the two radii.
+The unit is the same in both: the root mean square of the two radii.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from jaxreg.types import RigidTransform
 
 
 class Frame(NamedTuple):
-    """Where the two clouds were taken from: ``x = centre + length x'``. JAX or numpy arrays."""
+    """The way back to the two original clouds: ``x = centre + length x'``. JAX or numpy arrays."""
 
     source_centre: Float[Any, "3"]
     reference_centre: Float[Any, "3"]
@@ -34,8 +34,8 @@ def enter(
 ) -> tuple[Frame, Float[Array, "n 3"], Float[Array, "m 3"]]:
     """Both clouds around their own centroids in units of their common root mean square radius.
 
-    Padded rows become zero. The unit is ``sqrt((s^2 + r^2) / 2)`` of the two radii, so that it does
-    not change when the clouds are swapped; it is 1 when every point coincides with the centroid.
+    Padded rows become zero. The unit is ``sqrt((s^2 + r^2) / 2)`` of the two radii, the same when
+    the clouds are swapped; it is 1 if every point coincides with the centroid.
 
     Raises:
       ValueError: a cloud is not ``(n, 3)`` or has no row.
@@ -50,7 +50,7 @@ def enter(
 
 
 def transform_in(frame: Frame, transform: RigidTransform | None) -> RigidTransform:
-    """A transform of the original clouds (None: the identity) as one of the clouds in the frame."""
+    """A transform of the original clouds (None: the identity), for the clouds in the frame."""
     if transform is None:
         transform = rigid.identity(frame.source_centre.dtype)
     if not isinstance(frame.source_centre, np.ndarray):  # float64 stays what it is on the host
@@ -71,7 +71,7 @@ def measure(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], f
 
     The radius is 0 where the spread is no more than the rounding of the offset.
     """
-    # By way of one of the points, so that a common offset costs no digits.
+    # Relative to one of the points, so a common offset costs no digits.
     centre = points[0] + (points - points[0]).mean(axis=0)
     columns = (points - centre).T
     largest = max(float(np.abs(column).max()) for column in columns)

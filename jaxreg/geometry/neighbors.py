@@ -1,7 +1,7 @@
 """Neighbours inside one cloud and between two, by exact differences of coordinates.
 
 The product form ``|x|^2 - 2 x.y + |y|^2`` is not used for points: a thousand units away from the
-origin it names the wrong neighbour every second time.
+origin it gives the wrong neighbour half of the time.
 """
 
 import jax
@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._xla import row_min
 
 _BLOCK = 2048
-"""Points whose distances to all others are held at once."""
+"""Points whose distances to all others are in memory at once."""
 _ROUNDINGS = 4
-"""Of the largest coordinate, in units of its last digit: by how much two distances may differ and count
-as equal."""
+"""By how much two distances may differ and still count as equal, in units of the last digit of the
+largest coordinate."""
 
 
 def squared_distances(
@@ -28,7 +28,7 @@ def squared_distances(
 def without_padding(
     points: Float[Array, "n 3"], mask: Bool[Array, "n"] | None
 ) -> Float[Array, "n 3"]:
-    """`points` with every padded row set to zero, so that a NaN there can reach nothing."""
+    """`points` with every padded row set to zero, so a NaN there has no effect."""
     return points if mask is None else jnp.where(mask[:, None], points, 0)
 
 
@@ -38,9 +38,9 @@ def knn(
     """The `k` nearest other points of every point, nearest first (the graph N_o).
 
     If ``idx[i, r] = j`` then ``points[j]`` is the (r+1)-th nearest point of ``points[i]`` with
-    ``j != i``. Coincident points are neighbours of each other at distance 0. Equal distances are
-    ordered by coordinates (their bits), not by row, so that permuting the points permutes the graph.
-    Where fewer than `k` valid others exist, a point fills the rest of its list with itself.
+    ``j != i``. Coincident points are neighbours of each other at distance 0. Ties are broken by the
+    coordinates (their bits), not by the row, so permuting the points permutes the graph. A point
+    with fewer than `k` valid others fills its list up with itself.
 
     Raises:
       ValueError: `points` is not ``(n, 3)``, or not ``1 <= k < n``.
@@ -49,7 +49,7 @@ def knn(
     n = points.shape[0]
     if not 1 <= k < n:
         raise ValueError(
-            f"k = {k} neighbours do not exist in a cloud of n = {n} points: "
+            f"k = {k} neighbours in a cloud of n = {n} points: "
             "choose 1 <= k < n, or give more points."
         )
     points = jax.lax.stop_gradient(without_padding(jnp.asarray(points), mask))
@@ -67,7 +67,7 @@ def knn(
     if n <= _BLOCK:
         index = of_rows(row)
     else:
-        # Rows in blocks, since all distances of a large cloud at once would fill the memory.
+        # Rows in blocks, because all distances of a large cloud at once would fill the memory.
         blocks = jnp.pad(row, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
         index = jax.lax.map(of_rows, blocks).reshape(-1, k)[:n]
     # The barrier keeps XLA from merging later slices into the selection, which would turn the
@@ -91,30 +91,30 @@ def nearest_in(
     others: Float[Array, "m 3"],
     mask: Bool[Array, "m"] | None = None,
 ) -> Int[Array, "n"]:
-    """Index into `others` of the nearest valid one of every point.
+    """For every point, the row of the nearest valid one of `others`.
 
-    Of those that are equally near, up to rounding, it is the first.
+    It is the first of those that are equally near, up to rounding.
     """
     points, others = jax.lax.stop_gradient((points, without_padding(others, mask)))
     distance = squared_distances(points, others)
     if mask is not None:
         distance = jnp.where(mask[None, :], distance, jnp.inf)
-    # XLA may compute coordinates and distances anew for the comparison, to other last digits, and of
-    # points that coincide but for these no distance would equal the smallest.
+    # XLA may compute coordinates and distances again for the comparison, with other last digits;
+    # then, for points that differ in these only, no distance would equal the smallest.
     largest = jnp.max(jnp.abs(points), axis=1) + jnp.max(jnp.abs(others))
     rounding = _ROUNDINGS * jnp.finfo(points.dtype).eps * largest
     near = distance <= ((jnp.sqrt(row_min(distance)) + rounding) ** 2)[:, None]
     # The smallest value, then the first column that has it: two vectorised reductions. XLA runs
-    # argmin, which carries both through one reduction, element by element.
+    # argmin, which carries both through one reduction, one element at a time.
     column = jnp.arange(others.shape[0], dtype=jnp.int32)[None, :]
     return row_min(jnp.where(near, column, others.shape[0] - 1))
 
 
 def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:
-    """An order as good as random that depends on the points alone: not on their rows, nor on padding.
+    """A pseudo-random order that depends on the points alone: not on their rows, nor on padding.
 
-    A selection on a CPU keeps the best so far, and replaces them rarely where near points come at
-    random: that of 16 in 768 takes two thirds of its time after sorting by x.
+    On a CPU a selection keeps the best so far, and rarely replaces them if near points come in
+    random order: selecting 16 of 768 takes two thirds of the time that it takes after sorting by x.
     """
     width = jnp.finfo(points.dtype).bits
     bits = jax.lax.bitcast_convert_type(points, jnp.dtype(f"uint{width}"))

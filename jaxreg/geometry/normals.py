@@ -1,4 +1,4 @@
-"""Normals and plane-like covariances of a cloud, by the principal components of neighbourhoods."""
+"""Normals and plane-like covariances of a cloud, from the principal components of neighbourhoods."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxreg.geometry.numerics import safe_norm
 
 _SMALLEST_GAP = 1e-3
 """Least difference of the two smaller eigenvalues, over the sum of all three, at which a
-neighbourhood has a normal. Noise of float32 is far below, a plane far above."""
+neighbourhood has a normal. Float32 noise is far below it, a plane far above."""
 _OPEN, _OPEN_WIDTH = 0.4, 0.03
 """Mean offset of the neighbours along the surface, over their mean distance, at which an edge begins.
 Half a disc has 0.64, a whole one of 16 random points 0.27 by chance."""
@@ -33,13 +33,13 @@ def neighborhood_covariances(
 
 
 def _offsets(points, neighbors, mask) -> tuple[Array, Array]:
-    """From every point to itself and its neighbours (n, k + 1, 3); 1 where one counts, else 0."""
+    """Offsets from every point to itself and its neighbours (n, k + 1, 3); 1 if one counts, else 0."""
     points = without_padding(points, mask)
     own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
     counts = jnp.concatenate([jnp.ones_like(own, bool), neighbors != own], axis=1)
     if mask is not None:
         counts = counts & mask[:, None]
-    # Relative to the point itself: the mean of near points loses no digits to a far origin.
+    # Relative to the point itself, so the mean of near points loses no digits to a far origin.
     offsets = points[jnp.concatenate([own, neighbors], axis=1)] - points[:, None, :]
     return offsets, counts.astype(points.dtype)[..., None]
 
@@ -49,7 +49,7 @@ def normals(
 ) -> Float[Array, "n 3"]:
     """Unit normal of the plane through every point and its neighbours; its sign is arbitrary.
 
-    The eigenvector of the smallest eigenvalue of the neighbourhood's covariance. Zero where the
+    The eigenvector of the smallest eigenvalue of the neighbourhood's covariance. Zero if the
     neighbourhood has no normal: a line, a point, an isotropic ball, padding.
 
     Differentiable, with the derivative of the eigenvector where there is a normal and 0 elsewhere:
@@ -64,9 +64,9 @@ def edge_normals(
     unit_normals: Float[Array, "n 3"],
     mask: Bool[Array, "n"] | None = None,
 ) -> Float[Array, "n 3"]:
-    """Along the surface and across its edge, inwards: length 1 on an edge, 0 away from all edges.
+    """Inward direction in the surface, across its edge: length 1 on an edge, 0 away from all edges.
 
-    On the edge of a plate the neighbours lie on one side; `unit_normals` are those of `normals`.
+    On the edge of a plate all neighbours lie on one side; `unit_normals` are those of `normals`.
     """
     offsets, weight = _offsets(points, neighbors, mask)
     offsets = offsets * weight
@@ -75,7 +75,7 @@ def edge_normals(
     inward = jnp.sum(along, axis=1)
     length, total = safe_norm(inward), jnp.sum(safe_norm(along), axis=1)
     openness = length / jnp.where(total > 0, total, 1)
-    # The root of a share, since covariances take the square.
+    # The root of a share, because covariances take the square.
     share = jnp.exp(0.5 * jax.nn.log_sigmoid((openness - _OPEN) / _OPEN_WIDTH))
     return inward * (share / jnp.where(length > 0, length, 1))[:, None]
 
@@ -91,9 +91,9 @@ def surface_covariances(
     normal gives the identity: nothing is known about the surface there.
 
     With `edges` (`edge_normals`) the surface also ends: ``- (1 - e) b b^T`` with ``b`` across its
-    edge. On an edge the distance across it says where the point is, and of two plates nothing else
-    says how far one has slid along the other. An edge is met by an edge only: a point whose partner
-    lies inside a surface is as free as before.
+    edge. On an edge the distance across it fixes the point, and nothing else shows how far one of
+    two plates has slid along the other. Only an edge meets an edge: a point whose partner lies
+    inside a surface is as free as before.
     """
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
     if edges is not None:

@@ -1,4 +1,4 @@
-"""Elementary functions that stay right, and differentiable, at the points where they usually break.
+"""Elementary functions that stay correct and differentiable at the points where they usually break.
 
 Every function here has a finite derivative everywhere. Where the true one does not exist (a norm at
 the origin, an angle of parallel vectors) it is zero, which is a valid subgradient of each of them.
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """``sqrt(max(x, 0))`` whose derivative at ``x <= 0`` is 0 instead of infinite; NaN stays NaN."""
     zero = x <= 0
-    # The double `where`: the branch that is not taken must not see a zero either, since its
+    # The double `where`: the branch that is not taken must not see a zero either, because its
     # infinite derivative times the zero of the outer `where` would be NaN.
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, x)))
 
@@ -25,9 +25,9 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
 def leading_max(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
     """Maximum over the first axis; equal entries share its derivative.
 
-    The derivative of `jnp.max` divides by the number of entries that equal the maximum. Where XLA
-    computes those entries anew, in another kernel, they may differ from it in the last bit: none is
-    equal, and the derivative is NaN. Here two entries at a time are compared, and one always wins.
+    The derivative of `jnp.max` divides by the number of entries that equal the maximum. If XLA
+    computes those entries again, in another kernel, they may differ from it in the last bit: none
+    is equal, and the derivative is NaN. Here two entries at a time are compared, and one always wins.
     """
     while x.shape[0] > 1:
         half = (x.shape[0] + 1) // 2  # The halves of an odd number of entries overlap.
@@ -36,7 +36,7 @@ def leading_max(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
 
 
 def _unit_scale(x: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """`x` with its largest coordinate at magnitude 1, so that no square under- or overflows."""
+    """`x` scaled to a largest coordinate of magnitude 1: no square under- or overflows."""
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
     return x / jnp.where(largest > 0, largest, 1)
 

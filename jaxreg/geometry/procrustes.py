@@ -1,4 +1,4 @@
-"""Weighted Procrustes: the rigid transform between corresponding points, with its own derivative.
+"""Weighted Procrustes: the rigid transform between corresponding points, with a custom derivative.
 
 The derivative of the singular value decomposition divides by *differences* of singular values and is
 NaN for a cube, a cylinder or a line. The rotation itself is smooth there: its derivative divides by
@@ -18,11 +18,11 @@ def weighted_procrustes(
 ) -> RigidTransform:
     """The rigid transform that minimises ``sum_i w_i |R x_i + t - y_i|^2`` (Eq. 13).
 
-    `source[i]` corresponds to `reference[i]`. Weights need no normalisation; negative ones count as
-    zero. R is a rotation (det +1) for every input, mirrored and degenerate ones included. All
-    weights zero give the identity; a single positive weight gives ``R = I, t = y - x``. Where the
-    best rotation is not unique (a line, a point) R is one of the best, and the derivative is that of
-    least norm. First and higher derivatives are finite everywhere.
+    `source[i]` corresponds to `reference[i]`. Weights need not be normalised; negative weights
+    count as zero. R is a rotation (det +1) for every input, mirrored and degenerate ones included.
+    All weights zero give the identity; a single positive weight gives ``R = I, t = y - x``. If the
+    best rotation is not unique (a line, a point) R is one of the best, and the derivative is the
+    one of least norm. First and higher derivatives are finite everywhere.
 
     Raises:
       ValueError: the shapes are not ``(n, 3), (n, 3), (n,)``.
@@ -57,12 +57,12 @@ def robust_procrustes(
     *,
     rounds: int,
 ) -> RigidTransform:
-    """`weighted_procrustes`, then `rounds` times again with weights that forgive wrong pairs.
+    """`weighted_procrustes`, then `rounds` more times with less weight on pairs that do not fit.
 
     Each round multiplies the given weights by Geman and McClure's ``(s^2 / (s^2 + r_i^2))^2`` of the
-    residuals ``r_i = |R x_i + t - y_i|`` that the round before left. ``s`` is three times their median,
-    so that it needs no tuning: one wrong pair among hundreds loses its pull on a thin shape, where it
-    would turn the others about the axis. No round is the solution of Eq. 13.
+    residuals ``r_i = |R x_i + t - y_i|`` of the previous solution. ``s`` is three times their
+    median, so it needs no tuning. On a thin shape a single wrong pair among hundreds would turn the
+    others about its axis; here it loses its pull. With no rounds this is Eq. 13.
 
     Raises:
       ValueError: as `weighted_procrustes`.
@@ -89,7 +89,7 @@ def geman_mcclure_weights(
     ordered = jnp.sort(jnp.where(counts, square, jnp.inf))
     middle = jnp.maximum(jnp.sum(counts, dtype=jnp.int32) - 1, 0) // 2
     median = jnp.where(jnp.any(counts), ordered[middle], 0)
-    # Exact pairs leave nothing but rounding, which is no scale to judge others by.
+    # Exact pairs leave nothing but rounding, which is not a scale to judge others by.
     rounding = 16 * jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(reference))
     floor = jnp.maximum(jax.lax.stop_gradient(rounding), jnp.finfo(source.dtype).tiny ** 0.25)
     scale = 9 * median + floor**2
@@ -124,7 +124,7 @@ def _rotation_jvp(primals, tangents):
     At the optimum A is symmetric. Differentiating that, with ``dR = Omega R`` and Omega skew, gives
     ``Omega A + A Omega = (R dH)^T - R dH``, and for symmetric A the left side is the skew matrix of
     ``(trace(A) I - A) w``. Its eigenvalues are the sums of two (signed) singular values. The pseudo-
-    inverse leaves out those that vanish; it has derivatives of its own, of every order.
+    inverse leaves out those that vanish; it is differentiable to every order.
     """
     (covariance,), (covariance_dot,) = primals, tangents
     rotation = _rotation(covariance)

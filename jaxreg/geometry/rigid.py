@@ -1,7 +1,7 @@
-"""Rigid transforms: apply, compose, invert, and the way from and to 4x4 matrices and jaxlie.
+"""Rigid transforms: apply, compose, invert, and convert from and to 4x4 matrices and jaxlie.
 
 A transform may have leading axes, ``rotation (*b, 3, 3)`` and ``translation (*b, 3)``: one
-transform for every index of them.
+transform per index.
 """
 
 import math
@@ -16,18 +16,19 @@ from jaxreg.types import RigidTransform
 
 
 def identity(dtype=None) -> RigidTransform:
-    """The transform that moves nothing."""
+    """The identity transform."""
     return RigidTransform(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype))
 
 
 def apply(transform: RigidTransform, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """``R x + t`` for every point ``x``; the unit is that of `points`.
 
-    One transform moves points of any shape ``(..., 3)``. Many, with leading axes ``b``, move
-    ``(*b, ..., 3)``: each its own points.
+    One transform moves points of any shape ``(..., 3)``. Many, with leading axes ``b``, move points
+    ``(*b, ..., 3)``, each its own.
 
     Raises:
-      ValueError: the transform is not one, or the points do not begin with its leading axes.
+      ValueError: the transform has wrong shapes, or those of the points do not begin with its
+        leading axes.
     """
     batch = _leading_axes(transform)
     if points.ndim < 1 or points.shape[-1] != 3:
@@ -49,15 +50,15 @@ def compose(second: RigidTransform, first: RigidTransform) -> RigidTransform:
     Leading axes broadcast.
 
     Raises:
-      ValueError: one of them is not a transform, or their leading axes do not broadcast.
+      ValueError: one of them has wrong shapes, or their leading axes do not broadcast.
     """
     batches = _leading_axes(second), _leading_axes(first)
     try:
         batch = np.broadcast_shapes(*batches)
     except ValueError:
         raise ValueError(
-            f"transforms with the leading axes {batches[0]} and {batches[1]} do not compose: give "
-            "both the same axes, or one of them none."
+            f"transforms with the leading axes {batches[0]} and {batches[1]} do not match: give "
+            "both the same leading axes, or none to one of them."
         ) from None
     second, first = (
         RigidTransform(
@@ -74,7 +75,7 @@ def inverse(transform: RigidTransform) -> RigidTransform:
     """The transform from reference back to source: ``(R^T, -R^T t)``.
 
     Raises:
-      ValueError: it is not a transform.
+      ValueError: the transform has wrong shapes.
     """
     _leading_axes(transform)
     rotation = transform.rotation.mT
@@ -87,7 +88,7 @@ def to_matrix(transform: RigidTransform) -> Float[Array, "*b 4 4"]:
     """The homogeneous matrix ``[[R, t], [0, 1]]``.
 
     Raises:
-      ValueError: it is not a transform.
+      ValueError: the transform has wrong shapes.
     """
     batch = _leading_axes(transform)
     top = jnp.concatenate([transform.rotation, transform.translation[..., None]], axis=-1)
@@ -96,7 +97,7 @@ def to_matrix(transform: RigidTransform) -> Float[Array, "*b 4 4"]:
 
 
 def from_matrix(matrix: Float[Array, "*b 4 4"]) -> RigidTransform:
-    """The transform of a homogeneous matrix ``[[R, t], [0, 1]]``; the last row is not read.
+    """The transform of a homogeneous matrix ``[[R, t], [0, 1]]``; the last row is ignored.
 
     Raises:
       ValueError: it is not ``(..., 4, 4)``.
@@ -111,7 +112,7 @@ def to_jaxlie(transform: RigidTransform) -> Any:
 
     Raises:
       ImportError: jaxlie is not installed.
-      ValueError: it is not a transform.
+      ValueError: the transform has wrong shapes.
     """
     try:
         import jaxlie  # pyright: ignore[reportMissingImports]

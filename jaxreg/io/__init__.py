@@ -1,4 +1,4 @@
-"""Clouds from and to files: one function each way, the format chosen by the suffix."""
+"""Read and write clouds: one function each; the suffix chooses the format."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -50,14 +50,14 @@ def suffix(path: str | Path) -> str:
 
 
 def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
-    """The points of a file, float64, in its own unit and order; meshes are sampled by area.
+    """Read a point cloud: (n, 3) float64, in the file's unit and order. The suffix chooses the format.
 
     Each format may be packed by gzip (``.ply.gz``). Points that are NaN stay in place: they are for
     the caller to refuse or to drop. Nothing is ever unpickled.
 
     Raises:
       ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
-        truncated, its header names columns without x, y, z, or it holds no point; the message
+        truncated, its header names columns without x, y, z, or it contains no points; the message
         names the file, the row where there is one, and the remedy.
       ImportError: a LAS, LAZ or E57 file, and what reads it is not installed.
     """
@@ -76,12 +76,12 @@ def read_scan(path: str | Path) -> Scan:
     if suffix(path) not in _READERS:
         raise ValueError(unread.advice(path, READABLE))
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such file: correct the path.")
+        raise ValueError(f"{path}: no such file; check the path.")
     if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty (0 bytes): write it again.")
+        raise ValueError(f"{path} is empty (0 bytes): export it again.")
     # A damaged file holds numbers that overflow, and NaN that signal.
     with packed.unpacked(path) as file, np.errstate(all="ignore"):
         scan = _READERS[suffix(path)](file)
         if len(scan.points) == 0:
-            raise ValueError(f"{path} holds no point: write it again, or choose another file.")
+            raise ValueError(f"{path} contains no points: export it again, or choose another file.")
     return scan

@@ -9,7 +9,7 @@ from jaxreg.io.contents import Scan
 
 
 def read(path: Path) -> Scan:
-    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`.
+    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
 
     More columns than three (colours, intensity) are not read. In an NPZ file the array is `points`,
     or the only one that could be a cloud.
@@ -28,23 +28,23 @@ def read(path: Path) -> Scan:
 def read_arrays(
     path: str | Path, names: Sequence[str] = (), *, remedy: str
 ) -> dict[str, np.ndarray]:
-    """Every array of an ``.npz`` file, by its name, whatever it holds.
+    """Every array of an ``.npz`` file, by its name, of any kind.
 
     Raises:
-      ValueError: the file is missing, a directory, no ``.npz`` or only a part of one, or lacks an
-        array of `names`; the message names the file and ends with `remedy`.
+      ValueError: the file is missing, a directory, not an ``.npz`` or only a part of one, or lacks
+        an array of `names`; the message names the file and ends with `remedy`.
     """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory, not a file: {remedy}.")
     if not path.exists():
-        raise ValueError(f"no file {path}: {remedy}.")
+        raise ValueError(f"{path}: no such file; {remedy}.")
     try:
         arrays = _loaded(path)
         if isinstance(arrays, np.ndarray):
-            raise ValueError("it holds one array, without a name")
+            raise ValueError("it contains one array, without a name")
     except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
-        raise ValueError(f"{path} is no .npz of arrays ({error}): {remedy}.") from None
+        raise ValueError(f"{path} is not an .npz of arrays ({error}): {remedy}.") from None
     for name in names:
         if name not in arrays:
             raise ValueError(f"{path} has no array '{name}': {remedy}.")
@@ -66,7 +66,7 @@ def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:
     if len(clouds) != 1:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in named.items())
         raise ValueError(
-            f"{path} holds {shapes or 'nothing'}: save the cloud (n, 3) under the name 'points'."
+            f"{path} contains {shapes or 'nothing'}: save the cloud (n, 3) under the name 'points'."
         )
     return _points(named[clouds[0]], f"{path}['{clouds[0]}']")
 
@@ -76,13 +76,14 @@ def _points(array: np.ndarray, where: str) -> np.ndarray:
         array = np.stack([array[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
     if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[0] == 3 < array.shape[1]:
         raise ValueError(
-            f"{where} is {array.dtype} {array.shape}, one point a column: save its transpose (n, 3)."
+            f"{where} is {array.dtype} {array.shape}, one point per column: save its transpose (n, 3)."
         )
     if array.dtype.kind in "fiu" and array.ndim == 3 and array.shape[2] == 3:
         return array.reshape(-1, 3).astype(np.float64)  # an organised cloud, (height, width, 3)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(
-            f"{where} is {array.dtype} {array.shape}, not numbers (n, 3): save one point a row."
+            f"{where} is {array.dtype} {array.shape}, not numbers of shape (n, 3): "
+            "save one point per row."
         )
     return array[:, :3].astype(np.float64)
 

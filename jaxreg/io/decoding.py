@@ -33,7 +33,7 @@ def decoded(path: Path, content: bytes) -> str:
     text = content.decode(_encoding(content), errors="replace").replace("\ufeff", "")
     if _CONTROL.search(text) or (text.strip() and not _WORD.search(text)):
         raise ValueError(
-            f"{path} is no text file: give it the suffix of its format, or export it as text."
+            f"{path} is not a text file: give it the suffix of its format, or export it as text."
         )
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 

@@ -19,7 +19,9 @@ def read(path: Path) -> Scan:
         import pye57  # pyright: ignore[reportMissingImports]
     with path.open("rb") as file:
         if file.read(8) != b"ASTM-E57":
-            raise ValueError(f"{path} is no E57 file (it does not begin with ASTM-E57): export it.")
+            raise ValueError(
+                f"{path} is not an E57 file (it does not begin with ASTM-E57): export it."
+            )
     try:
         scans = _scans(pye57.E57(str(path)), path.stat().st_size)
     except Exception as error:  # noqa: BLE001 - libE57 raises types of its own

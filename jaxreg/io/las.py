@@ -1,4 +1,4 @@
-"""LAS and LAZ, the files of airborne and terrestrial laser scanners, by laspy (extra `las`)."""
+"""LAS and LAZ, the formats of airborne and terrestrial laser scanners, with laspy (extra `las`)."""
 
 import os
 import struct
@@ -18,7 +18,7 @@ _LARGEST = 2**31 - 1
 
 
 def read(path: Path) -> Scan:
-    """The points (n, 3), float64, scale and offset applied. Errors as `jaxreg.io.read_cloud`."""
+    """The points (n, 3), float64, scaled and offset. Raises what `jaxreg.io.read_cloud` raises."""
     laspy = _laspy(path)
     try:
         _check_header(path)
@@ -73,7 +73,7 @@ def _check_chunks(path: Path, start: int, size: int) -> None:
 def write(path: Path, points: np.ndarray) -> None:
     """Point format 0, steps of a 10^9th of the extent (the format stores integers).
 
-    Rows that are not finite are left out: integers have no NaN. The file then holds fewer points.
+    Rows that are not finite are left out, because integers have no NaN. The file then has fewer points.
 
     Raises:
       ImportError: laspy is missing.
@@ -83,7 +83,7 @@ def write(path: Path, points: np.ndarray) -> None:
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise ValueError(
-            f"{path}: no point is finite, and LAS stores no others: check the cloud, or choose "
+            f"{path}: no point is finite, and LAS stores only finite ones: check the cloud, or choose "
             "another format."
         )
     cloud = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
@@ -92,7 +92,7 @@ def write(path: Path, points: np.ndarray) -> None:
 
 
 def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
-    """The file `original` with its points turned and moved; errors as `read`.
+    """The file `original` with its points turned and moved; raises what `read` raises.
 
     Intensity, colours, times and whatever else it stores for a point stay, and so do scale and offset
     as long as the integers hold the new coordinates: else the offset becomes a whole number near them,
@@ -126,7 +126,7 @@ def _store(cloud, points: np.ndarray, path: Path, offsets: np.ndarray, scales: n
 
 
 def check_installed(path: Path) -> None:
-    """Raises ImportError where the file `path` could not be read or written for want of laspy."""
+    """Raise ImportError if `path` cannot be read or written because laspy is missing."""
     _laspy(path)
 
 

@@ -67,7 +67,7 @@ def uncommented(line: str) -> str:
 
 
 def recognised(path: Path, text: str) -> Layout | None:
-    """The layout of a file; None if it holds no point.
+    """The layout of a file; None if it contains no points.
 
     Raises:
       ValueError: a header names columns, but no coordinates; or what the first columns are is open.
@@ -162,16 +162,17 @@ def _without_points(path: Path, data: list, rows: list[list[str]]) -> None:
     line, fields = data[0][0], rows[0]
     if _COMMA.search(data[-1][1]):
         raise ValueError(
-            f"{path}, line {line}: '{data[0][1].strip()[:60]}' is no point: if commas are decimal "
+            f"{path}, line {line}: '{data[0][1].strip()[:60]}' is not a point: if commas are decimal "
             "marks here, write all numbers with decimal points."
         )
     if len(fields) < 3:
         raise ValueError(
-            f"{path}, line {line}: '{' '.join(fields)[:60]}' is no point, it has {len(fields)} "
+            f"{path}, line {line}: '{' '.join(fields)[:60]}' is not a point, it has {len(fields)} "
             "column(s): give x y z in a line."
         )
     raise ValueError(
-        f"{path}, line {data[-1][0]}: '{data[-1][1].strip()[:60]}' is no point: give x y z in a line."
+        f"{path}, line {data[-1][0]}: '{data[-1][1].strip()[:60]}' is not a point: write x y z on "
+        "each line."
     )
 
 
@@ -204,7 +205,7 @@ def _check_header(
             "to metres first, to UTM for instance."
         )
     if is_data(line) and len(names) < 3:
-        raise ValueError(f"{where}: '{' '.join(names)}' is no point: give x y z in a line.")
+        raise ValueError(f"{where}: '{' '.join(names)}' is not a point: give x y z in a line.")
     if is_data(line) and len(names) > width and columns.coordinates(names):
         raise ValueError(
             f"{where}: the header has {len(names)} names for {width} columns: part them by what "
@@ -215,7 +216,7 @@ def _check_header(
     titled = titled and not _LABEL.match(_joined(line, separator))
     if len(names) == width >= 3 and (is_data(line) or titled):
         raise ValueError(
-            f"{where}: the header names the columns {', '.join(names)[:80]}, and not x, y, z: call "
+            f"{where}: the header names the columns {', '.join(names)[:80]}, not x, y, z: call "
             "those that hold the coordinates x, y and z in this line."
         )
 

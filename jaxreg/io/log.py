@@ -1,4 +1,4 @@
-"""The log of a training run: `metrics.jsonl`, one JSON object a line."""
+"""The log of a training run: `metrics.jsonl`, one JSON object per line."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
-    """The columns of a `metrics.jsonl`, NaN where a line has no such entry.
+    """The columns of a `metrics.jsonl`; NaN if a line has no such entry.
 
     Raises:
       ValueError: there is no such file, it is empty, or a line is not a JSON object.

@@ -12,17 +12,17 @@ def read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
     """A 4x4 matrix from text, NPY, or the JSON that `jaxreg register` writes.
 
     Raises:
-      ValueError: there is no such file, or it holds no 4x4 matrix.
+      ValueError: there is no such file, or it does not contain a 4x4 matrix.
     """
     remedy = "write four lines of four numbers"
     try:
         matrix = np.asarray(_content(path), float)
     except FileNotFoundError:
-        raise ValueError(f"{path}: there is no such file: correct the path.") from None
+        raise ValueError(f"{path}: no such file; check the path.") from None
     except (ValueError, KeyError, TypeError, EOFError) as error:
-        raise ValueError(f"{path} holds no 4x4 matrix ({error}): {remedy}.") from None
+        raise ValueError(f"{path} does not contain a 4x4 matrix ({error}): {remedy}.") from None
     if matrix.shape != (4, 4):
-        raise ValueError(f"{path} holds an array {matrix.shape}, not a 4x4 matrix: {remedy}.")
+        raise ValueError(f"{path} contains an array {matrix.shape}, not a 4x4 matrix: {remedy}.")
     return matrix
 
 
@@ -32,6 +32,6 @@ def _content(path: Path) -> object:
         return content["transformation"] if isinstance(content, dict) else content
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
-    # Brackets and commas too, so that what Python prints can be pasted.
+    # Brackets and commas too: what Python prints can be pasted.
     numbers = re.sub(r"#.*|[\[\],;]", " ", path.read_text("utf-8")).split()
     return np.array(numbers, float).reshape(4, 4)

@@ -31,7 +31,7 @@ class Mesh(NamedTuple):
 def read(path: Path) -> Scan:
     """Points (n, 3) of the surface, uniform by area, the same in every run; float64.
 
-    Errors as `jaxreg.io.read_cloud`.
+    Raises what `jaxreg.io.read_cloud` raises.
     """
     mesh = load(path)
     if len(mesh.faces) == 0:
@@ -70,7 +70,7 @@ def sampled(mesh: Mesh) -> Scan:
     import trimesh  # a second of start-up that other formats need not pay
 
     # A triangle without three finite corners has no surface.
-    whole = np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1)
+    whole = np.isfinite(mesh.vertices[mesh.faces]).all(axis=(1, 2))
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces[whole], process=False)
     with np.errstate(all="ignore"):
         area = surface.area
@@ -182,7 +182,7 @@ def _malformed(path: Path, error: Exception) -> ValueError:
 def _check(path: Path, mesh: Mesh) -> None:
     vertices, faces = mesh
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"{path}: its vertices have no three coordinates: export it again.")
+        raise ValueError(f"{path}: its vertices do not have three coordinates: export it again.")
     wrong = (faces < 0).any(axis=1) | (faces >= len(vertices)).any(axis=1)
     if wrong.any():
         row = int(np.argmax(wrong))

@@ -26,7 +26,7 @@ class _File(NamedTuple):
 
 
 def read(path: Path) -> Scan:
-    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`."""
+    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises."""
     file = _opened(path)
     if _encoding(file) == "ascii":
         return Scan(_coordinates(path, file))
@@ -142,7 +142,7 @@ def _row_type(path: Path, header: dict[str, list[str]]) -> np.dtype:
         return row
     except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise ValueError(
-            f"{path}: FIELDS, SIZE, TYPE and COUNT of the PCD header do not fit ({error}): "
+            f"{path}: FIELDS, SIZE, TYPE and COUNT of the PCD header do not match ({error}): "
             "save it again."
         ) from None
 
@@ -190,11 +190,11 @@ def _coordinates(path: Path, file: _File) -> np.ndarray:
         except (IndexError, ValueError):
             told = line.decode("latin-1").strip()[:60]
             raise ValueError(
-                f"{path}, point {found - 1}: '{told}' is no point: mend or remove the line."
+                f"{path}, point {found - 1}: '{told}' is not a point: fix or remove the line."
             ) from None
     if found < file.count:
         raise ValueError(
-            f"{path} is truncated: {file.count} points are announced and {found} are there: "
+            f"{path} is truncated: {file.count} points are announced, but there are {found}: "
             "copy it again."
         )
     return points
@@ -205,7 +205,7 @@ def _rows(path: Path, file: _File) -> np.ndarray:
     if kind == "binary_compressed":
         return _columns(path, _decompressed(path, file.body), file.row, file.count)
     if kind != "binary":
-        raise ValueError(f"{path}: DATA '{kind}' is no PCD encoding: save it again as binary.")
+        raise ValueError(f"{path}: DATA '{kind}' is not a PCD encoding: save it again as binary.")
     if len(file.body) < file.count * file.row.itemsize:
         raise ValueError(
             f"{path} is truncated: {file.count} points are announced, and row "
@@ -227,7 +227,7 @@ def _decompressed(path: Path, body: bytes) -> bytes:
 def _columns(path: Path, content: bytes, row: np.dtype, count: int) -> np.ndarray:
     """Compressed files store one field after the other."""
     if len(content) < count * row.itemsize:
-        raise ValueError(f"{path}: the compressed data hold fewer than {count} points: save again.")
+        raise ValueError(f"{path}: the compressed data has fewer than {count} points: save again.")
     rows, position = np.empty(count, row), 0
     for name in _names(row):
         values = int(np.prod(row[name].shape))

@@ -1,4 +1,4 @@
-"""Where files are written: said before the work if it cannot be, and whole or as it was before."""
+"""Where files are written: checked before the work; a file is written whole or left as it was."""
 
 import contextlib
 import os
@@ -7,16 +7,16 @@ from pathlib import Path
 
 
 def check_place(path: Path, taken: Sequence[Path] = ()) -> None:
-    """Raises ValueError unless a file can be written there that replaces none of those `taken`."""
+    """Raise ValueError unless a file can be written there without replacing one of `taken`."""
     check_folder(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory: name a file in it.")
     if path.resolve() in [other.resolve() for other in taken]:
-        raise ValueError(f"{path} is read or written by this command already: choose another name.")
+        raise ValueError(f"{path} is already read or written by this command: choose another name.")
 
 
 def check_folder(path: Path) -> None:
-    """Raises ValueError unless there is a folder for the file."""
+    """Raise ValueError unless there is a folder for the file."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
 

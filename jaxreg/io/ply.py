@@ -1,4 +1,4 @@
-"""PLY: ascii and binary of both byte orders, with any other properties and elements, by plyfile."""
+"""PLY: ascii and binary of both byte orders, with any other properties and elements, with plyfile."""
 
 import contextlib
 import re
@@ -21,21 +21,21 @@ _NORMALS = ("nx", "ny", "nz")
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Vertices (n, 3) float64, triangles (f, 3), and notes. Errors as `jaxreg.io.read_cloud`."""
+    """Vertices (n, 3), triangles (f, 3), and notes. Raises what `jaxreg.io.read_cloud` raises."""
     data = _told(path)
     try:
         vertex = data["vertex"]
         points = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], axis=1)
     except KeyError:
         raise ValueError(
-            f"{path} has no element 'vertex': it is not a point cloud; export it again."
+            f"{path} has no element 'vertex', so it is not a point cloud: export it again."
         ) from None
     except ValueError as error:
         missing = "no field" in str(error)
         reason = "its vertices lack x, y or z" if missing else str(error)
         raise ValueError(f"{path}: {reason}: export it again.") from None
     if points.ndim != 2:
-        raise ValueError(f"{path}: its vertices have no three coordinates: export it again.")
+        raise ValueError(f"{path}: its vertices do not have three coordinates: export it again.")
     notes = ()
     if "tristrips" in data:
         notes = ("a mesh of triangle strips, of which the vertices alone are read",)
@@ -71,7 +71,7 @@ def write(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> No
 def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
     """Write a PLY file again with its vertices (and normals) moved and everything else kept.
 
-    x, y, z become double, so that large offsets lose nothing.
+    x, y, z become double, so large offsets lose nothing.
     """
     data = _told(original)
     elements = []

@@ -17,7 +17,7 @@ _HEADER = 10
 def read(path: Path) -> Scan:
     """The points of all stations in their common frame; rays without a return are left out.
 
-    Errors as `jaxreg.io.read_cloud`.
+    Raises what `jaxreg.io.read_cloud` raises.
     """
     text = decoded(path, path.read_bytes())
     rows = ((n, line) for n, line in lines(text) if line.strip())
@@ -58,8 +58,9 @@ def _station(
             raise ValueError
     except ValueError:
         raise ValueError(
-            f"{where}: no header of a station (PTX: columns, rows, four lines of three numbers, four "
-            "of four): export it again; if the lines hold x y z alone, name the file .xyz."
+            f"{where}: not the header of a station (PTX: columns, rows, four lines of three "
+            "numbers, four of four): export it again; if the lines hold x y z alone, name the file "
+            ".xyz."
         ) from None
     count = columns * height
     try:
@@ -68,7 +69,7 @@ def _station(
     except (ValueError, UserWarning) as error:
         told = " ".join(str(error).split())[:100]
         raise ValueError(
-            f"{where}: a point of this station is none ({told}): export it again."
+            f"{where}: a point of this station is not one ({told}): export it again."
         ) from None
     if len(points) < count:
         raise ValueError(

@@ -18,7 +18,7 @@ def corners(path: Path) -> np.ndarray:
     """The corners of all triangles, (f, 3, 3), float64.
 
     Raises:
-      ValueError: it is shorter than it says, or a corner is no three numbers.
+      ValueError: it is shorter than it says, or a corner is not three numbers.
     """
     content = path.read_bytes()
     if not _is_ascii(content):
@@ -31,7 +31,7 @@ def corners(path: Path) -> np.ndarray:
         except ValueError:
             line = content.count(b"\n", 0, match.start()) + 1
             raise ValueError(
-                f"{path}, line {line}: a corner is no three numbers: export it again."
+                f"{path}, line {line}: a corner is not three numbers: export it again."
             ) from None
     if len(values) % 9 or not re.search(rb"end\s*solid", content[-2000:], re.IGNORECASE):
         raise ValueError(f"{path} is truncated, its last triangle is not closed: export it again.")

@@ -1,4 +1,4 @@
-"""Text with a point a line: XYZ, TXT, CSV, ASC, PTS, XYZN, XYZRGB; in any encoding."""
+"""Text with one point per line: XYZ, TXT, CSV, ASC, PTS, XYZN, XYZRGB; in any encoding."""
 
 import array
 import re
@@ -17,7 +17,7 @@ _GRID = re.compile(r"\s*ncols\s+\d+\s+nrows\s+\d+", re.IGNORECASE)
 
 
 def read(path: Path) -> Scan:
-    """The points (n, 3), float64. Errors as `jaxreg.io.read_cloud`.
+    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
 
     Separated by blanks, tabs, commas, semicolons or bars; the decimal mark is a point or a comma.
     Columns x, y, z where a header names them, also in a comment above the points, with units ("X
@@ -39,7 +39,7 @@ def read(path: Path) -> Scan:
 
 
 def write(path: Path, points: np.ndarray) -> None:
-    """A point a line, 12 digits; a CSV file gets the header x,y,z."""
+    """One point per line, 12 digits; a CSV file gets the header x,y,z."""
     csv = path.suffix.lower() == ".csv"
     header, delimiter = ("x,y,z", ",") if csv else ("", " ")
     np.savetxt(path, points, fmt="%.12g", delimiter=delimiter, header=header, comments="")
@@ -54,7 +54,7 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
     text = decoded(original, original.read_bytes())
     layout = recognised(original, text)
     if layout is None:
-        raise ValueError(f"{original} holds no point: choose another file.")
+        raise ValueError(f"{original} contains no points: choose another file.")
     moved = iter(_points(original, text, layout) @ rotation.T + translation)
     commas = path.suffix.lower() == ".csv" and layout.separator is None and not layout.comma
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -136,16 +136,16 @@ def _row(where: str, line: str, layout: Layout) -> list[float]:
     fields = split(uncommented(line), layout.separator)
     if len(fields) <= max(layout.columns):
         raise ValueError(
-            f"{where}: '{line.strip()[:60]}' has {len(fields)} column(s), and a point needs "
+            f"{where}: '{line.strip()[:60]}' has {len(fields)} column(s), but a point needs "
             f"{max(layout.columns) + 1}: complete or remove the line."
         )
     row = []
     for column in layout.columns:
         value = number(fields[column], comma=layout.comma)
         if value is None:
-            hint = "mend or remove the line"
+            hint = "fix or remove the line"
             if re.fullmatch(r"[+-]?\d+,\d+", fields[column]):
                 hint = "if the comma is a decimal mark, write all numbers with decimal points"
-            raise ValueError(f"{where}: '{fields[column][:40]}' is no number: {hint}.")
+            raise ValueError(f"{where}: '{fields[column][:40]}' is not a number: {hint}.")
         row.append(value)
     return row

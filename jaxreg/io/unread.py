@@ -35,11 +35,11 @@ _BEGINNINGS = {
 def advice(path: Path, readable: Sequence[str]) -> str:
     """Why the suffix of `path` is not read, and what helps: by its name, or by how it begins."""
     name = path.with_suffix("").suffix if path.suffix.lower() == ".gz" else path.suffix
-    told = f"{path}: the suffix '{name}' is no format known here"
+    told = f"{path}: unknown format '{name}'"
     if name.lower() in _ELSEWHERE:
         return f"{told}: {_ELSEWHERE[name.lower()]}."
     if seems := _seems(path):
-        return f"{told}, and the file begins as '{seems}' does: give it that suffix."
+        return f"{told}, but the file begins as '{seems}' does: give it that suffix."
     return f"{told}: convert the file to one of {', '.join(readable)}."
 
 

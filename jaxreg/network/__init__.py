@@ -1,4 +1,4 @@
-"""The paper (arXiv:2307.14019), one file a stage.
+"""The paper (arXiv:2307.14019), one file per stage.
 
 | equation | says                               | function                 | file                   |
 |----------|------------------------------------|--------------------------|------------------------|
@@ -26,5 +26,5 @@
 | 17       | L_sc, spatial consistency          | spatial_consistency      | losses.py              |
 | 18       | their weighted sum over steps      | total_loss               | losses.py              |
 
-What the text leaves open is a field of `ModelConfig` or `LossConfig`, which says the reading taken.
+Where the text is ambiguous, a field of `ModelConfig` or `LossConfig` selects the reading.
 """

@@ -24,8 +24,8 @@ class BatchNorm(nn.Module):
     """Batch normalisation over all valid points of all clouds of a batch.
 
     While training, statistics run over the leading axes and over the `vmap` axis `BATCH_AXIS`;
-    padding does not count (but must be finite), and every point counts the same whatever the size
-    of its cloud. At evaluation running means are used and no batch axis is needed.
+    padding does not count (but must be finite), and every point counts the same, however large its
+    cloud. At evaluation running means are used and no batch axis is needed.
     """
 
     momentum: float
@@ -40,8 +40,7 @@ class BatchNorm(nn.Module):
 class _Normalize(nn.Module):
     """``(x - mean) / sqrt(var + epsilon) * scale + bias``, the variables named as Flax names them.
 
-    Flax's own takes the mean over the clouds of the mean over each cloud, which weighs a point by
-    the size of its cloud.
+    Flax's own averages the means of the clouds, which weighs a point by the size of its cloud.
     """
 
     momentum: float
@@ -80,7 +79,7 @@ def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
 
     count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)
     mean = over_batch(x) / count
-    # Two passes: E[x^2] - E[x]^2 cancels where the inlier network sees differences near zero.
+    # Two passes: E[x^2] - E[x]^2 cancels when the inlier network sees differences near zero.
     return mean, over_batch((x - mean[None, :]) ** 2) / count
 
 
@@ -101,7 +100,7 @@ class DGCNN(nn.Module):
         self, edges: Float[Array, "n k d"], mask: Bool[Array, "n"], *, train: bool
     ) -> Float[Array, "n c"]:
         edges = jnp.where(mask[:, None, None], edges, 0)
-        # K in front: the maximum over it is then an elementwise maximum of contiguous blocks.
+        # K first: the maximum over it is then an elementwise maximum of contiguous blocks.
         x, pooled = jnp.swapaxes(edges, 0, 1), []
         for channels in self.channels:
             x = gradient_written_out(nn.Dense(channels, use_bias=False)(x))

@@ -1,4 +1,4 @@
-"""Geometric neighbourhood inlier estimation: how well a neighbourhood survives the matching.
+"""Geometric neighbourhood inlier estimation: how well a neighbourhood survives matching.
 
 A correspondence is trusted (confidence near 1) when the neighbourhood of the source point and the
 same neighbourhood in the reference copy have the same structure (Eq. 9-11).
@@ -13,7 +13,7 @@ from jaxreg.network.features import BatchNorm
 
 
 def _confidence(consistency: Float[Array, "n"]) -> Float[Array, "n"]:
-    """``1 - tanh|x|``, written without the difference: where it is small it is still accurate."""
+    """``1 - tanh|x|``, written without the difference: accurate even when it is small."""
     return 2 * jax.nn.sigmoid(-2 * jnp.abs(consistency))
 
 
@@ -96,8 +96,8 @@ def select_inliers(
 ) -> Int[Array, "n_c"]:
     """Indices of the N_c most confident points, most confident first (Eq. 12).
 
-    Padded points come last. Where fewer than N_c points are valid the rest are padded ones, whose
-    weight is the caller's to set to zero.
+    Padded points come last. If fewer than N_c points are valid the rest are padded ones, and the
+    caller must set their weight to zero.
 
     Raises:
       ValueError: N_c exceeds the number of points.
@@ -105,8 +105,8 @@ def select_inliers(
     n = confidence.shape[0]
     if not 1 <= n_inliers <= n:
         raise ValueError(
-            f"N_c = {n_inliers} inliers cannot be taken from a cloud of n = {n} points: "
-            "set model.n_inliers to at most n."
+            f"N_c = {n_inliers} inliers of a cloud of n = {n} points: "
+            "choose 1 <= model.n_inliers <= n."
         )
     if mask is not None:
         confidence = jnp.where(mask, confidence, -1)

@@ -45,7 +45,7 @@ def included_angles(
         return included_angle(vectors, jnp.roll(vectors, -1, axis=1))[..., None]
     k = vectors.shape[1]
     rows, columns = jnp.triu_indices(k, 1)
-    # Half of the angles, since a[r, s] = a[s, r] and a[r, r] = 0.
+    # Half of the angles, because a[r, s] = a[s, r] and a[r, r] = 0.
     half = included_angle(vectors[:, rows], vectors[:, columns])
     zero = jnp.zeros((*vectors.shape[:1], k, k), vectors.dtype)
     upper = zero.at[:, rows, columns].set(half)
@@ -53,10 +53,10 @@ def included_angles(
 
 
 def rounding_error(points: Float[Array, "n 3"]) -> Float[Array, ""]:
-    """Differences of the coordinates of `points` up to this are rounding, and no edge.
+    """Differences of the coordinates of `points` up to this are rounding, not an edge.
 
-    Where many copies fall on one place, their edges are noise of 1e-17: an angle between two of
-    those would be arbitrary and its derivative 1e17.
+    If many copies fall on one place, their edges are noise of 1e-17: an angle between two of them
+    would be arbitrary and its derivative 1e17.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(points), initial=0))
     return 16 * jnp.finfo(points.dtype).eps * largest

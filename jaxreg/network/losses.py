@@ -1,8 +1,8 @@
 """The four unsupervised losses of one registration step (Eq. 14-17) and their sum (Eq. 18).
 
-None of them sees the true transform; `pose_error` does, for pairs that were made and whose pose is
-known, and is no part of the method. Sums run over points as in the paper; means over pairs are the
-caller's, so that the mix of the terms does not depend on the batch.
+None of them sees the true transform; `pose_error` does, for generated pairs whose pose is known,
+and is not part of the method. Sums run over points as in the paper; the caller takes means over
+pairs, so the mix of the terms does not depend on the batch.
 """
 
 import functools
@@ -38,7 +38,7 @@ def huber(x: Float[Array, "..."], beta: float) -> Float[Array, "..."]:
 def global_consistency(
     moved: PointCloud, reference: PointCloud, *, beta: float
 ) -> Float[Array, ""]:
-    """L_gc (Eq. 14): Huber of the squared distance to the nearest point, both ways, summed."""
+    """L_gc (Eq. 14): Huber of the squared distance to the nearest point, in both directions, summed."""
     # A NaN in a padded row would reach the derivative, through a product with a zero cotangent.
     moved = PointCloud(without_padding(*moved), moved.mask)
     reference = PointCloud(without_padding(*reference), reference.mask)

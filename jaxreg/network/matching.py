@@ -1,7 +1,8 @@
 """Dual neighbourhood fusion matching: from features to the reference copy (Eq. 3-6).
 
-Rows are source points i, columns reference points j. `valid` marks the columns that are no padding;
-a padded column has matching score exactly 0. Rows of padding hold finite values without meaning.
+Rows are source points i, columns reference points j. `valid` marks the columns that are not
+padding; a padded column has matching score exactly 0. Padded rows contain finite values without
+meaning.
 """
 
 from typing import NamedTuple
@@ -17,14 +18,14 @@ from jaxreg.geometry.numerics import safe_sqrt
 
 _FAR = 1e30
 KEPT = ("squared feature distance", "dual")
-"""Names of the maps that a gradient keeps; the others it computes again (see `model.iterate`)."""
+"""Names of the maps that a gradient stores; it recomputes the others (see `model.iterate`)."""
 
 
 def squared_feature_distance(
     source: Float[Array, "n c"], reference: Float[Array, "m c"]
 ) -> Float[Array, "n m"]:
     """``D[i, j]^2 = |source[i] - reference[j]|^2`` of features; rounding may leave it below zero."""
-    # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as they can be.
+    # |a|^2 - 2 a.b + |b|^2 cancels; about the centre the terms are as small as possible.
     center = jax.lax.stop_gradient(jnp.mean(reference, axis=0))[None, :]
     a, b = source - center, reference - center
     product = unfused(jnp.matmul(a, b.T, precision=Precision.HIGHEST))
@@ -50,11 +51,11 @@ def matching_scores(
 
 
 class Incidence(NamedTuple):
-    """A neighbour index ``idx`` (n, k), read both ways.
+    """A neighbour index ``idx`` (n, k), and its reverse.
 
     Entries ``start[j] : start[j] + count[j]`` of `member` name the points that have j as a
-    neighbour, so that the transpose of a gather is a gather too. On a CPU XLA runs the scatter-add
-    that it would otherwise be serially, ten times slower.
+    neighbour, so the transpose of a gather is a gather too. On a CPU XLA runs the scatter-add that
+    it would otherwise be serially, ten times slower.
     """
 
     idx: Int[Array, "n k"]
@@ -79,7 +80,7 @@ def neighborhood_sum(
 ) -> Float[Array, "n m"]:
     """``S[i, j] = sum of scores[i', j'] over i' in N(i), j' in N(j)`` (Eq. 4), ``S = A_P M A_Q^T``.
 
-    Nothing of size n x m x k is formed. With one neighbour a point, the 1-NN, this is
+    Nothing of size n x m x k is formed. With one neighbour per point, the 1-NN, this is
     ``scores[nearest_p][:, nearest_q]``.
     """
     source, reference = (
@@ -117,8 +118,8 @@ def _gather_both(x: Float[Array, "n m"], source: Incidence, reference: Incidence
 def gather_rows(x: Float[Array, "n m"], graph: Incidence) -> Float[Array, "n m"]:
     """``A x``: sum of the rows of the neighbours."""
 
-    # A loop, since XLA fuses nothing across its border: written out, whatever makes `x` would be
-    # computed anew in each of the gathers, at strided addresses.
+    # A loop, because XLA does not fuse across it: written out, whatever makes `x` would be computed
+    # again in each of the gathers, at strided addresses.
     def add(r, total):
         return total + x.at[graph.idx[:, r]].get(mode="promise_in_bounds")
 
@@ -144,7 +145,7 @@ def final_distance(
 
 
 class Matches(NamedTuple):
-    """What the matching stage hands on.
+    """The result of the matching stage.
 
     `copy` is the reference copy (Eq. 6). `dual_peak` and `final_peak` hold, per source point, the
     largest entry of the maps G and F, which is all that the spatial consistency loss reads.
@@ -175,7 +176,7 @@ def matching_maps(
 ) -> Maps:
     """The maps M, G, F (Eq. 3-5) from D and D-hat; None for D-hat is the single neighbourhood.
 
-    `nearest_graphs` are those of the 1-NN clouds where they differ from those of the input.
+    `nearest_graphs` are those of the 1-NN clouds if they differ from those of the input.
     """
     graphs, k = (source_graph, reference_graph), source_graph.idx.shape[1]
     scores, total = matching_scores(distance, valid), distance

@@ -1,7 +1,7 @@
 """The matching stage of large clouds, in blocks of rows (Eq. 3-6 with one (n, m) array in memory).
 
-`matching` holds about ten arrays of that size at once, which is the fastest way while they are small.
-Here the distances are computed again instead of kept: at 16,384 x 16,384 points one array is 1 GB.
+`matching` keeps about ten arrays of that size at once, which is fastest while they are small. Here
+the distances are recomputed instead of kept: at 16,384 x 16,384 points one array is 1 GB.
 """
 
 import functools
@@ -28,7 +28,7 @@ from jaxreg.network.matching import (
 BLOCK = 512
 """Rows (or columns) in a block."""
 LARGEST = 2**25
-"""Entries of a map above which blocks are used; below, whole maps take half of the time and at
+"""Blocks are used for maps of more entries than this; below, whole maps take half the time and at
 most about 1 GB."""
 
 
@@ -112,7 +112,7 @@ def _by_columns(function: Callable, x: Float[Array, "n m"]) -> Float[Array, "n m
 
 
 def _by_rows(function: Callable, *arrays: Float[Array, "n _"]) -> Any:
-    """``function(*arrays)`` of a function that works on every row alone, `BLOCK` rows at a time."""
+    """``function(*arrays)``, `BLOCK` rows at a time, for a function that treats each row alone."""
     blocks = [x.reshape(-1, BLOCK, x.shape[-1]) for x in arrays]
     # What a block computes is computed again in the backward pass, or memory would not be saved.
     result = jax.lax.map(lambda rows: jax.checkpoint(function)(*rows), blocks)
@@ -120,10 +120,10 @@ def _by_rows(function: Callable, *arrays: Float[Array, "n _"]) -> Any:
 
 
 def _padded(branch: Branch, count: int) -> Branch:
-    """The branch with `count` more source points, which are neighbours of nobody."""
+    """The branch with `count` more source points, which are neighbours of no point."""
     if count == 0:
         return branch
     widths = ((0, count), (0, 0))
-    # They list the first point as their neighbour; nothing reads what they sum up.
+    # They list the first point as their neighbour; nothing reads their sums.
     graph = incidence(jnp.pad(branch.source_graph.idx, widths))
     return branch._replace(source=jnp.pad(branch.source, widths), source_graph=graph)

@@ -1,7 +1,7 @@
 """The network: one registration step (Eq. 3 to 13 of the paper), and its iteration.
 
 ``variables = {"params": ..., "batch_stats": ...}`` is one plain dict, each with the keys `features`
-and `inliers`. Everything here is a pure function of one pair; a batch is the caller's `vmap`.
+and `inliers`. Everything here is a pure function of one pair; use `vmap` for a batch.
 """
 
 from collections.abc import Callable
@@ -38,15 +38,14 @@ from jaxreg.types import PointCloud, Registration, RigidTransform
 
 Variables = dict[str, Any]
 _MATCHES = "matches"
-"""Name of what the matching hands on, which a gradient keeps."""
+"""Name of the result of the matching, which a gradient stores."""
 
 
 class Graph(NamedTuple):
     """The neighbourhoods of one cloud; a rigid motion does not change them.
 
     `neighbors` serves features and inliers, `matching` the neighbourhood sum, `nearest` is the graph
-    with the 1-NN alone. `own` is the graph of the 1-NN cloud itself, where the configuration asks
-    for it.
+    with the 1-NN alone. `own` is the graph of the 1-NN cloud itself, if the configuration asks for it.
     """
 
     neighbors: Int[Array, "n k"]
@@ -56,7 +55,7 @@ class Graph(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One registration step, all that losses and pictures read.
+    """One registration step: all that losses and pictures read.
 
     `source` is the source before the step, `moved` after it, `transform` the motion between them.
     `inliers` are the indices of the N_c most confident points.
@@ -90,7 +89,7 @@ def neighborhood_graph(cloud: PointCloud, config: ModelConfig, *, own: bool | No
 
 
 def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
-    """Fresh `params` and `batch_stats` of the network that `config` describes."""
+    """Random initial `params` and `batch_stats` for the network of `config`."""
     features, inliers = _networks(config)
     k = config.k + config.include_self
     cloud, mask = jnp.ones((k + 1, 3)), jnp.ones(k + 1, bool)
@@ -144,7 +143,7 @@ def point_features(
 
 
 def _both_features(variables, points, graph, mask, config, train):
-    """Features of a cloud and, where asked for, of its 1-NN cloud as a cloud of its own."""
+    """Features of a cloud and, if asked for, of its 1-NN cloud as a separate cloud."""
     features, variables = point_features(variables, points, graph, mask, config=config, train=train)
     if graph.own is None:
         return (features, None), variables
@@ -181,7 +180,7 @@ def _match_pair(
         nearest_graphs = (source_graph.own.matching, reference_graph.own.matching)
     elif config.one_nn == "gather":
         # The feature of the 1-NN point is that of the same point in the input cloud. The root comes
-        # last, since XLA would take it anew, number by number, for each entry that is gathered.
+        # last, because XLA would take it again, number by number, for each entry that is gathered.
         nearest = (source_graph.nearest, reference_graph.nearest)
         nearest_distance = safe_sqrt(neighborhood_sum(squared, *nearest))
     elif config.one_nn == "self":
@@ -249,7 +248,7 @@ def iterate(
 
     def step(carry, _):
         total, variables = carry
-        # From the original points every time, so that rounding does not add up over the steps.
+        # From the original points every time, so rounding does not add up over the steps.
         points = rigid.apply(total, source.points)
         features, variables = _both_features(
             variables, points, source_graph, source.mask, config, train
@@ -267,9 +266,9 @@ def iterate(
         return (rigid.compose(motion, total), variables), seen
 
     start = (rigid.identity(source.points.dtype), variables)
-    # A step is computed again in the backward pass, but for its matches and the two maps that cost
-    # most: cheaper than writing out and reading back a dozen (n, m) arrays a step, and less than half
-    # of the memory. (In training the maps are not seen here: `one_at_a_time` computes them again.)
+    # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
+    # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
+    # memory. (In training the maps are not seen here: `one_at_a_time` recomputes them.)
     kept = jax.checkpoint_policies.save_only_these_names(*KEPT, _MATCHES)
     step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
@@ -287,11 +286,11 @@ def register_pair(
 ) -> Registration:
     """Register two clouds with a trained network; pure: jit, vmap and differentiate it.
 
-    `config` describes the network; of a whole configuration only `model` is read.
+    `config` describes the network; in a whole configuration only `model` is read.
 
     Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
-    outside a mask are padding and reach nothing, not even as NaN. With no valid point in a cloud
-    `valid` is False and the transform the identity.
+    outside a mask are padding and have no effect, even if they are NaN. With no valid point in a
+    cloud `valid` is False and the transform is the identity.
 
     Raises:
       ValueError: a cloud is not ``(n, 3)``; K is not smaller than a cloud; N_c exceeds the source.

@@ -1,4 +1,4 @@
-"""RIENet's released weights (AAAI 2022), the single-neighbourhood predecessor, as our variables.
+"""RIENet's published weights (AAAI 2022), the single-neighbourhood predecessor, as our variables.
 
 The file is a plain ``.npz`` of the arrays of its PyTorch state dict under their own names; no torch
 is needed to read it.
@@ -15,7 +15,7 @@ from jaxreg.io.arrays import read_arrays
 from jaxreg.network.model import Variables
 
 _MODEL = ModelConfig(
-    k=4,  # Its k = 5 counts the point itself, which its neighbourhood sum leaves out again.
+    k=4,  # Its k = 5 counts the point itself; its neighbourhood sum leaves it out again.
     k_matching=4,
     include_self=True,
     channels=(32, 32, 64, 128),
@@ -34,10 +34,10 @@ _LOSS = LossConfig(rho=0.0, l_in="squared", l_sc="F")
 
 
 def load_rienet(path: str | Path) -> tuple[Variables, Config]:
-    """The variables and the configuration of RIENet's weights for ModelNet40.
+    """Load RIENet's published weights for ModelNet40: their variables and their configuration.
 
     Raises:
-      ValueError: as `read_arrays`, or the file lacks an array of the network.
+      ValueError: the file is missing or not an ``.npz``, or it lacks an array of the network.
     """
     arrays = read_arrays(path, remedy="give the .npz of RIENet's state dict")
     try:

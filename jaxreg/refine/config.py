@@ -11,19 +11,19 @@ Gradient = Literal["unrolled", "implicit"]
 
 @dataclasses.dataclass(frozen=True)
 class RefineConfig:
-    """Refinement of a pose by the ICP family.
+    """Settings of `icp`, `point_to_plane`, `gicp` and `refine`.
 
-    Hashable: give it to `jax.jit` as a static argument. What changes from call to call, the largest
-    distance and the width of the kernel, the functions also take as arrays.
+    Hashable: give it to `jax.jit` as a static argument. The functions also take as arrays what
+    changes from call to call: the largest distance and the width of the kernel.
     """
 
     method: Method = "gicp"
-    """Point to point, point to plane, or generalised (plane to plane): that of `refine`. The
-    functions `icp`, `point_to_plane` and `gicp` are what their names say."""
+    """The method of `refine`: point to point, point to plane, or generalised (plane to plane). The
+    functions `icp`, `point_to_plane` and `gicp` ignore it."""
     iterations: int = 30
-    """Iterations, each with fresh correspondences."""
+    """Number of iterations, each with new correspondences."""
     max_correspondence_distance: float = math.inf
-    """Pairs farther apart than this (unit of the clouds) do not count."""
+    """Pairs that are farther apart than this (unit of the clouds) do not count."""
     trim: float = 1.0
     """Share of the closest pairs that count."""
     kernel: Kernel = "geman_mcclure"
@@ -34,32 +34,32 @@ class RefineConfig:
     both_directions: bool = False
     """Also pair every reference point with its nearest source point."""
     k: int = 10
-    """Neighbours of a point that its normal is computed from."""
+    """How many neighbours of a point its normal is computed from."""
     epsilon: float = 1e-3
     """Variance across a surface, in units of the variance along it (generalised ICP)."""
     correspondences_per_point: int = 1
-    """Partners of a point: the nearest and its neighbours. Several planes of a noisy surface agree
-    on where it is better than one does (generalised ICP)."""
+    """Partners of a point: the nearest and its neighbours. Several planes locate a noisy surface
+    better than one does (generalised ICP)."""
     edges: bool = False
-    """Surfaces end: their edges must meet, too (generalised ICP)."""
+    """Also match the edges where open surfaces end (generalised ICP)."""
     tolerance: float = 1e-5
-    """Converged is a pose whose last step turned by less than this (radians) and moved by less (in
-    radii of the clouds). A kernel that narrows until the end moves the pose until the end: where you
-    need a fixed point, as for "implicit", let it start narrow (`kernel_annealing` 1) and take more
+    """Converged when the last step turned by less (radians) and moved by less (radii of the
+    clouds). A kernel that narrows until the end moves the pose until the end: if you need a fixed
+    point, as for "implicit", let it start narrow (`kernel_annealing` 1) and take more
     iterations."""
     gradient: Gradient = "unrolled"
-    """How the pose is differentiated; its value is the same.
+    """How to differentiate the pose; its value is the same.
 
     "unrolled" goes back through every iteration: exact for the iterations that were made, whether
-    they converged or not, also twice; memory grows with their number. "implicit" applies the
-    implicit function theorem at the pose found: memory and time of one iteration, and the gradient
-    of the *solution*, right where the iterations converged. Take it inside training and wherever
-    there are many iterations. A motion that the pairs leave free keeps the derivative of the start.
+    they converged or not, and for second derivatives; memory grows with their number. "implicit"
+    applies the implicit function theorem at the pose found: memory and time of one iteration, and
+    the gradient of the *solution*, correct if the iterations converged. Use it inside training and
+    with many iterations. A motion that the pairs leave free keeps the derivative of the start.
     Second derivatives of "implicit" are not those of the solution."""
 
 
 def check_options(config: RefineConfig) -> None:
-    """Raises ValueError, with the value and what to choose instead, where `config` makes no sense."""
+    """Raise ValueError, with the value and what to choose instead, if a setting is out of range."""
     for name, choices in (("method", Method), ("kernel", Kernel), ("gradient", Gradient)):
         if getattr(config, name) not in get_args(choices):
             raise ValueError(
@@ -73,11 +73,11 @@ def check_options(config: RefineConfig) -> None:
          "choose a positive distance, or infinity for no limit"),
         ("trim", 0 < config.trim <= 1, "choose a share of the pairs, 0 < trim <= 1"),
         ("kernel_annealing", config.kernel_annealing >= 1,
-         "choose 1 or more: less would narrow the first kernel"),
+         "choose 1 or more: the first kernel must not be narrower than the last"),
         ("k", config.k >= 2, "choose at least 2: a plane needs a point and two neighbours"),
         ("epsilon", 0 < config.epsilon <= 1, "choose 0 < epsilon <= 1"),
         ("correspondences_per_point", 1 <= config.correspondences_per_point <= most,
-         f"choose 1 to k + 1 = {most}, since the others are neighbours of the first"),
+         f"choose 1 to k + 1 = {most}, because the others are neighbours of the first"),
         ("tolerance", config.tolerance >= 0, "choose 0 or more"),
     ):  # fmt: skip
         if not sensible:

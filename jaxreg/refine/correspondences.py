@@ -1,4 +1,4 @@
-"""Which point of the source belongs to which point of the reference, and how much a pair counts."""
+"""Which source point is paired with which reference point, and how much a pair counts."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from jaxreg.geometry.neighbors import nearest_in
 class Pairs(NamedTuple):
     """Pair `i` joins ``source[source_index[i]]`` to ``reference[reference_index[i]]``.
 
-    Pairs with `mask` False join anything and count for nothing.
+    Pairs with `mask` False are arbitrary and do not count.
     """
 
     source_index: Int[Any, "p"]
@@ -54,10 +54,10 @@ def with_neighbors(
     *,
     forward: int,
 ) -> Pairs:
-    """`pairs`, and those of the same points with the neighbours of their partners.
+    """`pairs`, plus the pairs of the same points with the neighbours of their partners.
 
-    Several planes of a noisy surface agree on where it is better than one does. The first `forward`
-    pairs are those of the source's points, the others of the reference's.
+    Several planes locate a noisy surface better than one does. The first `forward` pairs are those
+    of the source's points, the others of the reference's.
     """
     source, reference = pairs.source_index, pairs.reference_index
     k = source_neighbors.shape[1]

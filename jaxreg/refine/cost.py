@@ -1,4 +1,4 @@
-"""What pairs under a pose cost: the part in which the methods of the ICP family differ."""
+"""The cost of pairs under a pose: the part in which the methods of the ICP family differ."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from jaxreg.types import RigidTransform
 
 
 class Scene(NamedTuple):
-    """Both clouds in the frame, what is known of their surfaces, and how their pairs are weighed.
+    """Both clouds in the frame, what is known about their surfaces, and how to weight their pairs.
 
     A surface is what the method needs: nothing, unit normals (n, 3) or covariances (n, 3, 3).
     """
@@ -27,7 +27,7 @@ class Scene(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Of every pair ``M_i`` and ``r_i^T M_i r_i``; `mask` is False where no surface is known."""
+    """``M_i`` and ``r_i^T M_i r_i`` of every pair; `mask` is False if no surface is known."""
 
     metric: Float[Array, "p 3 3"]
     squared: Float[Array, "p"]
@@ -35,7 +35,7 @@ class Cost(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """Pairs under a pose: their points, before and after it, and what they cost.
+    """Pairs under a pose: their points, before and after it, and their cost.
 
     `metric` is ``w_i M_i``, `squared` is ``r_i^T M_i r_i``, `weights` are ``w_i``; `counts` is False
     for pairs beyond the largest distance, outside the trim or without a surface.
@@ -51,7 +51,7 @@ class Matched(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What tells the methods apart: the cost of residuals ``r_i = moved - target``, and the step."""
+    """What distinguishes the methods: the cost of residuals ``r_i = moved - target``, and the step."""
 
     cost: Callable[[Scene, RigidTransform, Pairs, Array], Cost]
     step: Callable[[RigidTransform, Matched], RigidTransform]
@@ -76,5 +76,5 @@ def match(
 
 
 def lower_by_gauss_newton(pose: RigidTransform, matched: Matched) -> RigidTransform:
-    """One Gauss-Newton step with the metrics held; no pair leaves the pose as it is."""
+    """One Gauss-Newton step with the metrics held fixed; without any pair the pose stays as it is."""
     return gauss_newton_step(pose, matched.moved, matched.target, matched.metric)

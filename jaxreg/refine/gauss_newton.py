@@ -1,7 +1,7 @@
 """One Gauss-Newton step on a rigid pose: linearise, solve a damped 6x6 system, update.
 
-The cost is ``sum_i r_i^T M_i r_i`` with ``r_i = R x_i + t - y_i``. The metric ``M_i`` says what
-kind of ICP it is: ``w I`` point to point, ``w n n^T`` point to plane, ``w (C_y + R C_x R^T)^-1``
+The cost is ``sum_i r_i^T M_i r_i`` with ``r_i = R x_i + t - y_i``. The metric ``M_i`` decides the
+kind of ICP: ``w I`` point to point, ``w n n^T`` point to plane, ``w (C_y + R C_x R^T)^-1``
 generalised.
 """
 
@@ -15,11 +15,12 @@ from jaxreg.types import RigidTransform
 
 _DAMPING = 1e-5
 """Added to the diagonal, in units of its mean. Ten times the rounding error of the sums in float32:
-it keeps a motion that the pairs do not see (along a plane, about a sphere) finite and near zero."""
+it keeps a motion that the pairs do not constrain (along a plane, about a sphere) finite and near
+zero."""
 _LARGEST_ROTATION = 0.5
-"""Radians of one step. A linearisation says nothing beyond."""
+"""Largest rotation of one step, in radians. A linearisation is not valid beyond it."""
 _LARGEST_TRANSLATION = 1.0
-"""Length of one step, in units of the frame."""
+"""Largest translation of one step, in units of the frame."""
 
 
 def gauss_newton_step(

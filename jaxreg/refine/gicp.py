@@ -33,16 +33,16 @@ def gicp(
 
     ``r_i = R x_i + t - y_i`` with ``y_i`` nearest to the moved ``x_i``, and
     ``M_i = 2 e (C_y + R C_x R^T)^-1``, held fixed during a step, where ``e`` is `config.epsilon`:
-    of covariances that are as small across a surface, a residual across two parallel ones then
-    counts as its length. Covariances that are not given are those of planes: 1 along, ``e`` across,
-    from `config.k` neighbours; with `config.edges`, of surfaces that end (`edge_normals`). The
-    kernel weighs ``sqrt(r^T M r)``. With more than one of `config.correspondences_per_point`, a
-    point is also paired with the nearest neighbours of its partner, which averages the noise of
-    their planes. Everything else is as for `icp`.
+    for two parallel planes with this epsilon, a residual across them then counts with its length.
+    Covariances that are not given are those of planes: 1 along, ``e`` across, from `config.k`
+    neighbours; with `config.edges`, of surfaces that end (`edge_normals`). The kernel applies to
+    ``sqrt(r^T M r)``. With `config.correspondences_per_point` above 1, a point is also paired with
+    neighbours of its nearest point, which averages out the noise of their planes. Everything else
+    is as for `icp`.
 
     Raises:
-      ValueError: a shape or an option is wrong, or a cloud whose neighbours are needed has not more
-        than `config.k` points.
+      ValueError: a shape or an option is wrong, or a cloud whose neighbours are needed has only
+        `config.k` points or fewer.
     """
     problem = set_up(
         source, reference, initial=initial, source_mask=source_mask, reference_mask=reference_mask,
@@ -68,7 +68,7 @@ def _described(
     covariances: Float[Array, "n 3 3"] | None,
     config: RefineConfig,
 ) -> tuple[Int[Array, "n k"] | None, Float[Array, "n 3 3"]]:
-    """The neighbours that are further partners, and the covariances, given or made."""
+    """The neighbours that are additional partners, and the covariances, given or computed."""
     if covariances is not None and config.correspondences_per_point == 1:
         return None, covariances
     graph = knn(points, config.k, mask)
@@ -87,12 +87,12 @@ def surface_cost(
     *,
     epsilon: float,
 ) -> Cost:
-    """A residual costs what both surfaces say, ``M_i = 2 e (C_y + R C_x R^T)^-1``."""
+    """The cost of a residual, from both surfaces: ``M_i = 2 e (C_y + R C_x R^T)^-1``."""
     rotation = pose.rotation[None]
     turned = jnp.matmul(rotation, scene.source_surface, precision=Precision.HIGHEST)
     turned = jnp.matmul(turned, rotation.mT, precision=Precision.HIGHEST)
     combined = turned[pairs.source_index] + scene.reference_surface[pairs.reference_index]
-    # Padding may hold NaN covariances; its pairs count for nothing.
+    # Padding may have NaN covariances; its pairs do not count.
     identity = jnp.eye(3, dtype=combined.dtype)[None]
     combined = jnp.where(pairs.mask[:, None, None], combined, identity)
     metric = 2 * epsilon * eigen3x3.inverse(combined)

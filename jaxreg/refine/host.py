@@ -21,7 +21,7 @@ from jaxreg.types import RigidTransform
 class Refined(NamedTuple):
     """A pose in float64 (numpy), how it was found, and how well it is determined.
 
-    `converged`: the last step was below the tolerance; None where nothing was refined.
+    `converged`: the last step was below the tolerance; None if nothing was refined.
     """
 
     transform: RigidTransform
@@ -41,12 +41,12 @@ def refine_on_host(
 
     Centred and scaled in float64, solved in JAX's default precision, composed in float64, with
     corresponding points from a k-d tree. It stops when a step turns by less than `config.tolerance`
-    radians and moves by less than as many radii of the cloud. Above 30,000 points every k-th one comes
-    first, and then all of them for up to `config.iterations` more.
+    radians and moves by less than as many radii of the cloud. Above 30,000 points it first refines
+    with every k-th one, then with all of them for up to `config.iterations` more.
 
     Raises:
-      ValueError: a cloud is not (n, 3), not numeric, holds NaN or infinity, or has fewer than three
-        points; or an option is wrong.
+      ValueError: a cloud is not (n, 3), not numeric, contains NaN or infinity, or has fewer than
+        three points; or an option is wrong.
     """
     clouds = [
         check_points(p, name)[0] for p, name in ((source, "source"), (reference, "reference"))
@@ -83,17 +83,17 @@ def refine_indexed(
     distance: float,
     config: RefineConfig,
 ) -> Refined:
-    """The same of indexed clouds in one frame: nothing is checked, thinned, indexed or scaled again.
+    """The same for indexed clouds in one frame: nothing is checked, thinned, indexed or scaled again.
 
-    `distance` is the largest of corresponding points, in the unit of the frame.
+    `distance` is the largest between corresponding points, in the unit of the frame.
     """
     check_options(config)
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
     pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config)
-    # It is orthogonal to float32 only, until here.
+    # Until here it is orthogonal only to float32.
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)
-    # One pair for every point of the source, as `pose_uncertainty` has them: the way back sees the
-    # same distances again.
+    # One pair for every point of the source, as in `pose_uncertainty`: in reverse the distances are
+    # the same again.
     forward = np.arange(len(pairs.mask)) < len(source.points)
     uncertainty = _uncertainty(
         pose, source.padded, source.scale, reference.padded, reference.scale, reference.normals,
@@ -105,7 +105,7 @@ def refine_indexed(
 
 
 def unrefined(pose: RigidTransform) -> Refined:
-    """A pose as it is, of which nothing is known."""
+    """A pose as it is, without any knowledge of how good it is."""
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)
     zero, one = np.zeros(()), np.ones(())
     unknown = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), zero, zero, np.zeros(3), one)

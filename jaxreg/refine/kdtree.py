@@ -1,7 +1,7 @@
-"""Iterations whose pairs come from a k-d tree on the host: the driver of all three residuals.
+"""Iterations whose pairs come from a k-d tree on the host: the driver for all three methods.
 
 The tree finds the pairs in float64 on the CPU, the step is the pure one of `icp`, `point_to_plane`
-or `gicp`, jitted. Arrays are padded to a few sizes, so that a new size of cloud seldom compiles.
+or `gicp`, jitted. Arrays are padded to a few sizes, so a new size of cloud seldom needs a compilation.
 """
 
 import dataclasses
@@ -24,13 +24,13 @@ from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import RigidTransform
 
 _COARSE = 30_000
-"""Points of a cloud that find the pose before all of them refine it."""
+"""Number of points that find the pose before all of them refine it."""
 _SMALLEST = 512
 """Smallest padded size: below, one more compilation costs more than the padding."""
 
 
 class IndexedCloud(NamedTuple):
-    """A cloud on the host with its tree, and on the device, padded, with its normals and edges.
+    """A cloud: on the host with its tree, and padded on the device with its normals and edges.
 
     Coordinates times `scale` are those in the frame of a pair: a cloud is indexed once, in its own
     unit, and placed in many frames.
@@ -59,7 +59,7 @@ class IndexedCloud(NamedTuple):
 def index_cloud(
     points: Float[np.ndarray, "n 3"], *, k: int, normals: Float[np.ndarray, "n 3"] | None = None
 ) -> IndexedCloud:
-    """Tree, normals (of `k` neighbours, unless given) and edges of a cloud; fewer where it is small."""
+    """Tree, normals (from `k` neighbours, unless given) and edges of a cloud; fewer if it is small."""
     tree = cKDTree(points)
     found = min(k, len(points) - 1) + 1
     # One more than asked for: the point finds itself, and a row of its own index does not count.
@@ -83,14 +83,15 @@ def iterate(
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
-    The kernel narrows to its final width. Where a step is below `config.tolerance` half of the
-    remaining widths are skipped, and at the final width all are. Large clouds first converge with
-    every k-th point.
+    The kernel narrows to its final width. After a step below `config.tolerance` half of the
+    remaining widths are skipped; at the final width all are. Large clouds first converge with every
+    k-th point.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     levels = [(stride, widths)] if stride == 1 else [(stride, widths), (1, np.ones_like(widths))]
-    # The distance is in the weighting; one of every pair its own would compile every time.
+    # The distance is in the weighting; a static one that differs from pair to pair would compile
+    # every time.
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
@@ -132,7 +133,7 @@ def tree_pairs(
         back = (reference.points[rows] * reference.scale - translation) @ rotation
         source_index = np.concatenate([source_index, source.nearest(back)[1]])
         reference_index = np.concatenate([reference_index, rows])
-        # A sum of two sizes, so that the sizes of the clouds alone decide on the program.
+        # A sum of two sizes, so that only the sizes of the clouds decide which program runs.
         size += padded_size(len(rows), smallest=_SMALLEST)
     count = len(source_index)
     padding = (0, size - count)
@@ -161,7 +162,7 @@ def _step(pose, source, reference, pairs, kernel_scale, distance, width, *, conf
 
 
 def _surface(shape, config: RefineConfig):
-    """What the method knows of a surface with these normals and edges."""
+    """What the method uses of a surface with these normals and edges."""
     across, ends = shape
     if config.method == "gicp":
         return surface_covariances(across, config.epsilon, ends if config.edges else None)

@@ -1,4 +1,4 @@
-"""The methods of the ICP family by their names."""
+"""The methods of the ICP family, by name."""
 
 from jaxtyping import Array, Bool, Float
 
@@ -24,10 +24,10 @@ def refine(
     """`icp`, `point_to_plane` or `gicp`, as `config.method` says.
 
     Raises:
-      ValueError: as the method does.
+      ValueError: what the method raises.
     """
     functions = {"icp": icp, "point_to_plane": point_to_plane, "gicp": gicp}
-    # An unknown name is refused with all other options.
+    # An unknown name is refused together with all other options.
     return functions.get(config.method, gicp)(
         source,
         reference,

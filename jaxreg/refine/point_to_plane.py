@@ -27,14 +27,13 @@ def point_to_plane(
     """The pose after a fixed number of Gauss-Newton steps on ``sum_i w_i (n_i . r_i)^2``.
 
     ``r_i = R x_i + t - y_i``, where ``y_i`` is the reference point nearest to the moved ``x_i`` and
-    ``n_i`` its unit normal, of `config.k` neighbours unless `reference_normals` are given (zero
-    where there is none). The kernel weighs the distances to the planes; everything else is as for
-    `icp`. A motion that no plane opposes (a cloud that slides along a plane) is left out of the
-    pose's change.
+    ``n_i`` its unit normal, of `config.k` neighbours unless `reference_normals` are given (zeros
+    where there is none). The kernel applies to the distances to the planes; everything else is as
+    for `icp`. A motion that no plane opposes (a cloud that slides along a plane) does not change
+    the pose.
 
     Raises:
-      ValueError: a shape or an option is wrong, or the reference has not more than `config.k`
-        points.
+      ValueError: a shape or an option is wrong, or the reference has only `config.k` points or fewer.
     """
     problem = set_up(
         source, reference, initial=initial, source_mask=source_mask, reference_mask=reference_mask,
@@ -51,9 +50,9 @@ def point_to_plane(
 def plane_cost(
     scene: Scene, pose: RigidTransform, pairs: Pairs, residual: Float[Array, "p 3"]
 ) -> Cost:
-    """A residual costs the square of its part across the reference, ``M_i = n_i n_i^T``."""
+    """The cost of a residual is the square of its part across the reference: ``M_i = n_i n_i^T``."""
     normal = scene.reference_surface[pairs.reference_index]
-    # Where padding has been given a normal it may be NaN; its pair counts for nothing.
+    # A given normal of a padded point may be NaN; its pair does not count.
     mask = pairs.mask & jnp.any(normal != 0, axis=-1)
     normal = jnp.where(mask[:, None], normal, 0)
     across = jnp.sum(normal * residual, axis=-1)

@@ -27,14 +27,14 @@ def icp(
 
     Every iteration pairs each moved source point with its nearest reference point and solves
     ``min sum_i w_i |R x_i + t - y_i|^2`` in closed form. ``w_i`` is 1, or the weight of the kernel
-    at the pair's distance over its width; 0 beyond the largest distance and outside the trim. Where
-    no pair is left, the pose stays what it was, so that no overlap gives `initial`.
+    at the pair's distance over its width; 0 beyond the largest distance and outside the trimmed
+    share. If no pair is left, the pose stays as it is, so no overlap gives `initial`.
 
     `max_correspondence_distance` and `kernel_scale`, the width of the kernel (None: taken from the
-    distances themselves), have the unit of the clouds, may be traced arrays, and win over `config`.
+    distances themselves), have the unit of the clouds, may be traced arrays, and override `config`.
 
     Differentiable in both clouds and in `kernel_scale` as `config.gradient` says; which point is
-    nearest is a constant of the derivative, which is exact wherever the pairs do not change.
+    nearest is a constant of the derivative, so it is exact as long as the pairs do not change.
 
     Raises:
       ValueError: a shape or an option is wrong.
@@ -50,13 +50,13 @@ def icp(
 def point_cost(
     scene: Scene, pose: RigidTransform, pairs: Pairs, residual: Float[Array, "p 3"]
 ) -> Cost:
-    """A residual costs its squared length, ``M_i = I``."""
+    """The cost of a residual is its squared length: ``M_i = I``."""
     metric = jnp.broadcast_to(jnp.eye(3, dtype=residual.dtype), (*residual.shape, 3))
     return Cost(metric, jnp.sum(residual**2, axis=-1), pairs.mask)
 
 
 def procrustes_step(pose: RigidTransform, matched: Matched) -> RigidTransform:
-    """The best pose for weighted pairs of points; no pair leaves the pose as it is."""
+    """The best pose for weighted pairs of points; without any pair the pose stays as it is."""
     solved = weighted_procrustes(matched.source, matched.target, matched.weights)
     found = jnp.any(matched.weights > 0)
     return jax.tree.map(lambda new, old: jnp.where(found, new, old), solved, pose)

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.refine.config import Kernel
 
 _SMALLEST_SCALE = 1e-3
-"""Lower end of a kernel width that is taken from the residuals, in units of the frame: exact copies
-have no residual at all, and a width of zero would leave no weight for anything else."""
+"""Smallest kernel width taken from the residuals, in units of the frame: exact copies have no
+residual at all, and a width of zero would leave no weight for anything else."""
 
 
 class Weighting(NamedTuple):
@@ -96,7 +96,7 @@ def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:
 def widenings(
     iterations: int, annealing: float, dtype: jnp.dtype
 ) -> Float[np.ndarray, "iterations"]:
-    """How much wider than its final width the kernel is: from `annealing` to 1 by equal factors.
+    """How many times wider than its final width the kernel is: from `annealing` to 1 by equal factors.
 
     A single iteration has the final width.
     """
@@ -112,8 +112,9 @@ def masked_quantile(
 ) -> Float[Array, ""]:
     """The smallest valid value that at least `share` of the valid ones do not exceed (none: 0).
 
-    Of values that are not negative: their bits order as they do, so that the largest number that fewer
-    than so many lie below is found bit by bit. On a CPU seven times as fast as sorting 3000 of them.
+    For non-negative values, whose bits have the same order as they do: the largest number that has
+    fewer than so many values below it is found bit by bit. On a CPU this is seven times as fast as
+    sorting 3000 of them.
     """
     count = jnp.sum(mask, dtype=jnp.int32)
     # The small subtraction keeps a rounded-up product (0.7 * 10 = 7.000001) from taking one more.
@@ -127,8 +128,8 @@ def masked_quantile(
         larger = found | (jnp.ones((), integer) << jnp.asarray(high - k, integer))
         return jnp.where(jnp.sum(bits < larger, dtype=jnp.int32) < rank, larger, found)
 
-    # The bit of the sign is 0.
+    # The sign bit is 0.
     found = jax.lax.fori_loop(1, high + 1, step, jnp.zeros((), integer))
-    # The nearest one, since XLA may have computed the values anew, to another last bit.
+    # The nearest one, because XLA may have computed the values again, with another last bit.
     apart = jnp.maximum(bits, found) - jnp.minimum(bits, found)
     return jnp.where(count > 0, values[jnp.argmin(apart)], 0)

@@ -1,7 +1,7 @@
-"""The loop of all three methods: pair, weigh, step; and the two ways to differentiate its result.
+"""The loop of all three methods: pair, weight, step; and the two ways to differentiate its result.
 
-The methods differ in what they know of a surface, in what a residual costs (`Method.cost`), and in
-how the cost of given pairs is lowered (`Method.step`). All the rest is here.
+The methods differ in what they know about a surface, in the cost of a residual (`Method.cost`), and
+in how they lower the cost of given pairs (`Method.step`). Everything else is here.
 """
 
 from typing import NamedTuple
@@ -21,11 +21,11 @@ from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import Refinement, RigidTransform
 
 _LEAST_PULL = 1e-3
-"""A motion of which an iteration takes back less than this share is one that the pairs leave free."""
+"""If an iteration takes back less than this share of a motion, the pairs leave the motion free."""
 
 
 class Problem(NamedTuple):
-    """A start and a scene in their frame; neighbours where points have more than one partner."""
+    """A start and a scene in their frame; neighbours if points have more than one partner."""
 
     where: frame.Frame
     start: RigidTransform
@@ -64,7 +64,7 @@ def set_up(
 def solve(problem: Problem, method: Method, *, config: RefineConfig) -> Refinement:
     """The pose after `config.iterations` of `method` from the start, and how well it fits there.
 
-    Where no pair is left, the pose stays what it was.
+    If no pair is left, the pose stays as it is.
     """
     implicit = config.gradient == "implicit"
     pose, change = _iterate(_held(problem) if implicit else problem, method, config)
@@ -76,7 +76,7 @@ def solve(problem: Problem, method: Method, *, config: RefineConfig) -> Refineme
 def _iterate(
     problem: Problem, method: Method, config: RefineConfig
 ) -> tuple[RigidTransform, Float[Array, ""]]:
-    """The last pose, and by how much the last step changed it."""
+    """The last pose, and how much the last step changed it."""
 
     def step(pose: RigidTransform, widening: Array):
         pairs = _pairs(problem, pose, config)
@@ -158,7 +158,7 @@ def _held(problem: Problem) -> Problem:
 def _report(
     problem: Problem, method: Method, pose: RigidTransform, converged: Bool[Array, ""]
 ) -> Refinement:
-    """The pose in the unit of the clouds, and what the pairs of all source points say about it."""
+    """The pose in the unit of the clouds, and what the pairs of all source points show about it."""
     where, scene = problem.where, problem.scene
     moved = rigid.apply(pose, scene.source)
     pairs = closest_pairs(

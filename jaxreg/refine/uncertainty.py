@@ -1,7 +1,7 @@
-"""How well surfaces determine a pose: its 6x6 covariance, and the motions that they leave free.
+"""How well surfaces determine a pose: its 6x6 covariance, and the motions they leave free.
 
-Both come from the distances to the planes of the reference, whatever method found the pose: points
-that slide along a surface are the same surface to any scanner.
+Both are computed from distances to the reference's planes, whichever method found the pose, because
+a point may slide along a surface unnoticed.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -24,17 +24,17 @@ from jaxreg.refine.solve import set_up
 from jaxreg.types import RigidTransform
 
 WEAK = 0.01
-"""A motion is weak when it changes the distances to the surfaces by a smaller mean square than this,
-for a motion of one (1/3 for surfaces that face all ways)."""
+"""A motion is weak if a unit of it changes the distances to the surfaces by less than this in the
+mean square (1/3 for surfaces that face all directions)."""
 _SMALLEST_EIGENVALUE = 1e-6
-"""Of the information matrix, relative to its largest: what is below counts as this much, so that a
-free motion has a huge variance instead of an infinite one."""
+"""Floor of the eigenvalues of the information matrix, relative to the largest: a free motion has a
+huge variance instead of an infinite one."""
 _PITCH = 0.1
 """Translation along the axis per radian, in radii of the cloud, that makes a rotation a screw."""
 
 
 class PoseUncertainty(NamedTuple):
-    """What the pairs say about a small motion ``(omega, v)`` of the moved source.
+    """What the pairs show about a small motion ``(omega, v)`` of the moved source.
 
     The motion is ``y -> exp(omega) (y - centre) + centre + v``: rotation vector (radians) first,
     then translation (unit of the clouds), both in the axes of the reference; `centre` is the
@@ -52,7 +52,7 @@ class PoseUncertainty(NamedTuple):
 
 
 class WeakDirection(NamedTuple):
-    """A motion that changes no distance to the surfaces by much.
+    """A motion that barely changes any distance between the surfaces.
 
     `axis` is a unit vector, `point` a point of the axis of a rotation or screw (for a translation:
     the centre of the cloud). `strength` is the mean square change of the distances per unit motion
@@ -66,7 +66,7 @@ class WeakDirection(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For people: "rotation about axis (0.00, 0.00, 1.00)"."""
+        """In words: "rotation about axis (0.00, 0.00, 1.00)"."""
         axis = ", ".join(f"{value:.2f}" for value in np.round(self.axis, 2) + 0.0)
         verb = {"rotation": "rotation about axis", "screw": "screw motion about axis"}
         return f"{verb.get(self.kind, 'translation along')} ({axis})"
@@ -86,13 +86,12 @@ def pose_uncertainty(
 ) -> PoseUncertainty:
     """Information and covariance of a pose, from nearest pairs; options as for `point_to_plane`.
 
-    The covariance assumes independent errors of the distances. Nearest points of two samplings of
-    one surface share errors, so that it is a lower bound. Without any pair everything but `centre`
-    and `length` is zero; `weight` tells.
+    The covariance assumes that the errors of the distances are independent. It is a lower bound,
+    because neighbouring points share errors. Without any pair, `weight` and everything but `centre`
+    and `length` are zero.
 
     Raises:
-      ValueError: a shape or an option is wrong, or the reference has not more than `config.k`
-        points.
+      ValueError: a shape or an option is wrong, or the reference has only `config.k` points or fewer.
     """
     where, start, scene, *_ = set_up(
         source, reference, initial=transform, source_mask=source_mask,
@@ -108,7 +107,7 @@ def pose_uncertainty(
 
 
 def about(uncertainty: PoseUncertainty, centre: Float[np.ndarray, "3"]) -> PoseUncertainty:
-    """The same uncertainty, its motions about another `centre` (unit of the clouds); numpy.
+    """The same uncertainty for motions about another `centre` (unit of the clouds); numpy.
 
     A rotation ``omega`` about the old centre moves the new one by ``omega x (new - old)``.
     """
@@ -136,7 +135,7 @@ def uncertainty_of_pairs(
     matched = match(scene, rigid.identity(moved.dtype), pairs, POINT_TO_PLANE)
     information, _ = normal_equations(matched.moved, matched.target, matched.metric)
     weight = jnp.sum(matched.weights)
-    # Six parameters were fitted; fewer weights than that determine nothing.
+    # Six parameters were fitted; less weight than that determines nothing.
     variance = jnp.sum(matched.weights * matched.squared) / jnp.maximum(weight - 6, 1)
     units = jnp.concatenate([jnp.ones(3, moved.dtype), jnp.full(3, where.length)])
     scaling = units[:, None] * units[None, :]
@@ -218,5 +217,5 @@ def _raised_eigenvalues(information: Float[Array, "6 6"]):
 
 
 def _upright(axis: np.ndarray) -> np.ndarray:
-    """The axis or its opposite, so that the largest coordinate is positive."""
+    """The axis or its opposite, whichever has a positive largest coordinate."""
     return axis * np.sign(axis[np.argmax(np.abs(axis))])

@@ -8,10 +8,10 @@ from jaxreg.search.config import SearchConfig
 
 @dataclasses.dataclass(frozen=True)
 class RegisterConfig:
-    """Registration of two scans on the host (`jaxreg.register`)."""
+    """Settings of `jaxreg.register`, for two scans on the host."""
 
     search: SearchConfig = SearchConfig()
-    """The search for a pose, where no start is given."""
+    """The search for a pose, used if no start is given."""
     refine: RefineConfig | None = RefineConfig(
         iterations=10,
         kernel_annealing=8.0,
@@ -20,17 +20,19 @@ class RegisterConfig:
         epsilon=0.01,
         edges=True,
     )
-    """The refinement of what the search finds, or of the start; None leaves it as it is."""
+    """The refinement of the pose that the search finds, or of the start; None leaves it as it
+    is."""
     search_points: int = 1024
-    """Most points of a cloud in the search and in the verdict; larger clouds are averaged in voxels."""
+    """The search and the verdict use at most this many points of a cloud; larger clouds are
+    averaged in voxels."""
     refine_points: int = 4096
-    """Most points of a cloud in the refinement."""
+    """The refinement uses at most this many points of a cloud."""
     learned: bool = False
-    """Match points by learned features in place of the moments that these read: finds 1 to 4 % more
-    pairs at 70 % overlap, and takes a quarter longer."""
+    """Match points by learned features, computed from the moments: finds 1 to 4 % more pairs at 70
+    % overlap, and takes a quarter longer."""
     inlier_spacings: float = 1.5
-    """A point agrees with the other cloud within this many spacings of it, those of the clouds reduced
-    to `search_points`."""
+    """A point counts as overlapping within this many spacings of the other cloud (spacing after
+    reduction to `search_points`)."""
     refine_spacings: float = 2.0
-    """Largest distance of corresponding points in the refinement, in spacings of the clouds it has,
-    where `refine.max_correspondence_distance` says nothing else."""
+    """Largest distance of corresponding points in the refinement, in spacings of its clouds, unless
+    `refine.max_correspondence_distance` is set."""

@@ -19,8 +19,6 @@ _UNITS = (
     (10.0, "centimetres and millimetres"),
     (3.2808, "metres and feet"),
 )
-_ALIKE = 1.1
-"""Sizes within this factor are not worth a word."""
 _UNIT_LIKE = 1.3
 """Scans of one thing rarely show parts whose sizes differ by more from a ratio of units."""
 _FLAT, _THIN = 1e-3, 1e-2
@@ -54,19 +52,24 @@ def compared(
     source: Float[np.ndarray, "n 3"],
     reference: Float[np.ndarray, "m 3"],
     names: tuple[str, str] = ("source", "reference"),
+    *,
+    least: float = 1.1,
 ) -> list[str]:
-    """A sentence where the sizes of two clouds differ by a tenth or more: of units, or of scales."""
+    """A sentence where the sizes differ by a factor of `least` or more: of units, or of scales.
+
+    The size is the median distance from the centre, so that parts of one thing differ somewhat too.
+    """
     sizes = [_size(points) for points in (source, reference)]
     if min(sizes) <= 0:
         return []
     ratio = max(sizes) / min(sizes)
-    if ratio < _ALIKE:
+    if ratio < least:
         return []
     large, small = names if sizes[0] >= sizes[1] else names[::-1]
     many = f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
     told = f"the {large} is {many} times the size of the {small}"
     if unit := _unit(ratio):
-        return [f"{told}: are their units {unit}? Bring both to one"]
+        return [f"{told}: are their units {unit}? Bring both to one unit"]
     return [f"{told}: if both show the whole of one thing, their scales differ"]
 
 

@@ -14,7 +14,7 @@ from jaxreg.geometry.clouds import check_pose, padded_size
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import prepare, verdict
+from jaxreg.scans import diagnosis, prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
 from jaxreg.search.learned import load_features
@@ -24,17 +24,17 @@ from jaxreg.types import RigidTransform
 _SMALLEST = 512
 """Smallest size of a padded cloud in the search."""
 _TURN_COST = 0.01
-"""What half a turn costs in the choice of a pose, in units of the search's score: of poses that agree
-equally (a symmetric shape) the one that turns least is taken."""
+"""What half a turn costs in the choice of a pose, in units of the search's score: among poses that
+agree equally (a symmetric shape) the one that turns least is chosen."""
 _RIVAL_DEG, _RIVAL_DISTANCE = 15.0, 0.2
-"""A pose that turns by more than this from the chosen one, or moves the source's centroid farther away
-(in the unit of the frame), is another pose and no variant of it."""
+"""A pose that turns by more than this from the chosen one, or moves the source's centroid farther
+away (in the unit of the frame), is another pose and not a variant of it."""
 
 
 class Alternative(NamedTuple):
-    """Another pose that the search found: where it lays the source, and how much worse it agrees.
+    """Another pose that the search found, and how much worse it agrees.
 
-    `lead` is in shares of the points; near 0, the two poses cannot be told apart.
+    `lead` is in shares of the points; near 0 the two poses agree equally well.
     """
 
     transform: RigidTransform
@@ -43,25 +43,25 @@ class Alternative(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanRegistration:
-    """Where the source lies in the frame of the reference, and how far that can be trusted.
+    """What `register` returns: the source's pose in the reference's frame, and how far to trust it.
 
-    float64, in the unit of the input, a row for every row of the source. `transformation` is the 4x4
-    form of (`rotation`, `translation`). `correspondences[i]` is the reference point nearest to source
-    point `i` after alignment (NaN for a dropped point), and `confidence[i]`, in [0, 1], says how near:
-    ``(1 - (d / max_correspondence_distance)^2)^2``. That distance, within which two points count as
-    the same surface, follows from their spacing. `fitness` is the share of the source's points within
-    it, `inlier_rmse` the root mean square distance of those, `overlap` the share of both clouds within
-    it of the other, at equal density.
+    float64, in the unit of the input, one row per row of the source. `transformation` is the 4x4
+    form of (`rotation`, `translation`). `correspondences[i]` is the reference point nearest to
+    source point `i` after alignment (NaN for a dropped point), and `confidence[i]`, in [0, 1], how
+    near: ``(1 - (d / max_correspondence_distance)^2)^2``. That distance, within which two points
+    count as the same surface, follows from their spacing. `fitness` is the share of the source's
+    points within it, `inlier_rmse` the root mean square distance of those, `overlap` the share of
+    both clouds within it of the other, at equal density.
 
-    `success` is False when the pose should not be trusted, and `reason` says why in a sentence;
-    `probability` is the calibrated chance that the pose is right, and `evidence` is what it is computed
-    from. `alternatives` are the other poses that the search found, the best first.
+    `success` is False if the pose should not be trusted, and `reason` says why in one sentence;
+    `probability` is the calibrated chance that the pose is right, and `evidence` is what it is
+    computed from. `alternatives` are the other poses that the search found, the best first.
 
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
-    reference's distinct points; NaN where nothing was refined or no surfaces were near each other.
-    `weak_directions` are the motions that the clouds hardly resist. `converged` says whether the last
-    step of the refinement was below its tolerance (None: not refined). `dropped` counts the non-finite
-    rows of both clouds.
+    reference's distinct points; NaN if nothing was refined or no surfaces were near each other.
+    `weak_directions` are the motions that barely change the fit. `converged` says whether the last
+    step of the refinement was below its tolerance (None: not refined). `dropped` counts the
+    non-finite rows of both clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -90,7 +90,7 @@ class ScanRegistration:
 
 
 class _Problem(NamedTuple):
-    """Two prepared clouds in one frame; `distance` is that within which points count as the same."""
+    """Two prepared clouds in one frame; points within `distance` count as the same."""
 
     source: Prepared
     reference: Prepared
@@ -108,7 +108,7 @@ class _Problem(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """A pose in the frame, how much better it is than the next that differs, and the others."""
+    """A pose in the frame, how much better it is than the next distinct one, and the others."""
 
     pose: RigidTransform
     rival: float
@@ -124,18 +124,18 @@ def register(
     nonfinite: Literal["raise", "drop"] = "raise",
     config: RegisterConfig | None = None,
 ) -> ScanRegistration:
-    """The rigid transform ``y = R x + t`` that lays `source` on `reference`, with a verdict.
+    """Register two scans: the transform ``y = R x + t`` from source to reference, with a verdict.
 
-    Clouds are (n, 3) and (m, 3), anything numpy understands, in one unit, or what `jaxreg.prepare`
-    made of them; neither their sizes nor their order nor their origin play a role. `initial` (4x4 or
-    a `RigidTransform`) starts from a known pose and skips the search, so that nothing is known of rival
-    poses. `max_rotation_deg` says how far the clouds may be turned at most (None: by anything), which
-    settles symmetric shapes. The same input gives the same bits.
+    The clouds are array-likes (n, 3) and (m, 3) in one unit, or results of `jaxreg.prepare`; size,
+    order of the points and origin do not matter. `initial` (4x4 or a `RigidTransform`) starts from
+    a known pose. The search is skipped, so `alternatives` is empty and the verdict does without
+    rival poses. `max_rotation_deg` is the largest rotation to consider (None: any); it decides
+    between the poses of a symmetric shape. The same input gives the same bits.
 
     Raises:
-      ValueError: a cloud is not numeric (n, 3) with three finite points or more (the message names
-        the row), `initial` is not a rigid transform, an option makes no sense, or a cloud was prepared
-        with another configuration.
+      ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the
+        message names the row), `initial` is not rigid, an option is out of range, or a cloud was
+        prepared with another configuration.
     """
     config = RegisterConfig() if config is None else config
     _check_options(max_rotation_deg, config)
@@ -158,7 +158,7 @@ def register(
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}
-"""The smallest sensible value of these settings; the others must be positive."""
+"""The smallest allowed value of these settings; the others must be positive."""
 
 
 def _check_options(max_rotation_deg: float | None, config: RegisterConfig) -> None:
@@ -170,7 +170,7 @@ def _check_options(max_rotation_deg: float | None, config: RegisterConfig) -> No
     if max_rotation_deg is not None and not 0 < max_rotation_deg <= 180:
         raise ValueError(
             f"max_rotation_deg must be above 0 and at most 180, got {max_rotation_deg}: leave it out "
-            "for clouds that may be turned by anything."
+            "for clouds in any orientation."
         )
 
 
@@ -198,16 +198,16 @@ def _pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig)
 
 
 def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
-    """The most plausible pose, and how much more plausible it is than the next that differs."""
+    """The most plausible pose, and how much more plausible it is than the next distinct one."""
     where, most = problem.where, math.radians(max_rotation_deg or 180.0)
     poses, score, allowed = _searched_poses(problem, most)
     turned = np.radians(rotation_angle_deg(poses.rotation, np.eye(3)[None]))
-    # Where no pose is allowed, the best of the others is at least an answer.
+    # If no pose is allowed, the best of the others is at least an answer.
     allowed = allowed if allowed.any() else np.ones_like(allowed)
     best = int(np.argmax(np.where(allowed, score, -np.inf) - _TURN_COST * turned / np.pi))
     apart = np.linalg.norm(poses.translation - poses.translation[best], axis=1)
     angle = rotation_angle_deg(poses.rotation, poses.rotation[best][None])
-    # A pose that turns too far is no rival: it was ruled out.
+    # A pose that turns too far is not a rival: it was ruled out.
     others = allowed & ((angle > _RIVAL_DEG) | (apart > _RIVAL_DISTANCE))
     rival = float(score[best] - score[others].max()) if others.any() else verdict.NO_RIVAL
     alternatives = tuple(
@@ -220,7 +220,7 @@ def _search(problem: _Problem, max_rotation_deg: float | None) -> _Found:
 def _searched_poses(
     problem: _Problem, most: float
 ) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
-    """The poses of the search in the frame of the pair, in float64, their scores, which are allowed."""
+    """The poses of the search in the pair's frame (float64), their scores, and which are allowed."""
     where, config = problem.where, problem.config
     # Twice the radius: a usual shape then fills the unit sphere.
     unit = prepare.in_steps(2 * float(where.length))
@@ -232,7 +232,7 @@ def _searched_poses(
     unmoved = frame.transform_in(
         where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3))
     )
-    # Clouds that lie farther apart than float32 reaches do not overlap where they are anyway.
+    # Clouds that lie farther apart than float32 reaches do not overlap as they are anyway.
     also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
     found = _program(config)(*described, also, np.float32(most))
     poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
@@ -257,7 +257,7 @@ def _nth(poses: RigidTransform, i: int) -> RigidTransform:
 
 
 def _refine(problem: _Problem, pose: RigidTransform) -> Refined:
-    """The pose refined with more points than the search had; or as it is."""
+    """The pose refined with more points than the search had, or as it is."""
     config = problem.config
     if config.refine is None:
         return unrefined(pose)
@@ -300,7 +300,7 @@ def _result(
         ),
         success=chance >= verdict.TRUSTED,
         probability=chance,
-        reason=verdict.reason(judged, weak) if chance < verdict.TRUSTED else "",
+        reason=_reason(problem, judged, weak) if chance < verdict.TRUSTED else "",
         overlap=judged.overlap,
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
@@ -314,8 +314,17 @@ def _result(
     )
 
 
+def _reason(problem: _Problem, judged: verdict.Evidence, weak: tuple[WeakDirection, ...]) -> str:
+    """Why the pose is not trusted, and whether the clouds seem to be in different units."""
+    source, reference = (c.points * c.radius for c in (problem.source, problem.reference))
+    units = diagnosis.compared(source, reference, least=3.0)
+    return " ".join(
+        [verdict.reason(judged, weak), *(f"{told[:1].upper()}{told[1:]}." for told in units)]
+    )
+
+
 def _nearest(problem: _Problem, pose: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
-    """Of every point of the source: distance, in the frame, to the nearest of the reference; which."""
+    """For every source point: distance, in the frame, to the nearest reference point, and its index."""
     source, reference, length = problem.source, problem.reference, float(problem.where.length)
     moved = source.points @ (pose.rotation.T * (source.radius / length)) + pose.translation
     near, index = prepare.nearest(reference.tree, moved * (length / reference.radius))
@@ -323,7 +332,7 @@ def _nearest(problem: _Problem, pose: RigidTransform) -> tuple[np.ndarray, np.nd
 
 
 def _covariance(uncertainty: PoseUncertainty, length: float) -> Float[np.ndarray, "6 6"]:
-    """About the centroid of the reference, which is the origin of the frame; NaN where unknown."""
+    """About the centroid of the reference, which is the origin of the frame; NaN if unknown."""
     if not uncertainty.weight > 0:
         return np.full((6, 6), np.nan)
     units = np.repeat([1.0, length], 3)

@@ -1,9 +1,9 @@
-"""A cloud made ready, once: checked, centred, at two densities, with trees, normals and descriptors.
+"""A cloud prepared once: checked, centred, at two densities, with trees, normals and descriptors.
 
 Everything here is float64 on the host. Float32 at an offset of 1e6 m has a resolution of 6 cm, so
-offset and unit are taken off before any array reaches a device, and put back at the end. Nothing in
-a `Prepared` depends on a partner: what a pair has in common (one unit, one density) is chosen from
-a few steps, so that a cloud that meets many others is thinned and described once for each step.
+offset and unit are removed before any array reaches a device, and restored at the end. Nothing in a
+`Prepared` depends on a partner: what a pair has in common (one unit, one density) is chosen from a
+few steps, so a cloud that meets many others is thinned and described once per step.
 """
 
 import dataclasses
@@ -24,9 +24,9 @@ from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
 
 FINEST = 1e-6
-"""The resolution of float32 in a cloud of radius 1: a spacing below it is none."""
+"""The resolution of float32 in a cloud of radius 1: a smaller spacing counts as zero."""
 _CUBES = 1 << 20
-"""Up to this many cubes, a table of all of them is quicker than sorting the occupied ones."""
+"""Up to this many cubes, a table of all of them is faster than sorting the occupied ones."""
 _STEPS = 4
 """Units and densities that pairs are compared at, per factor of two."""
 _UNALIKE = 1.3
@@ -35,9 +35,9 @@ _UNALIKE = 1.3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Level:
-    """A cloud at one density, in its own frame. What is expensive is made when first used, and kept.
+    """A cloud at one density, in its own frame. What is expensive is computed on first use, and kept.
 
-    `normals`, where the user has brought some, are those of the nearest points of the whole cloud.
+    `normals`, if the user gave some, are those of the nearest points of the whole cloud.
     """
 
     points: Float[np.ndarray, "v 3"]
@@ -66,7 +66,7 @@ class Level:
         return agreement(self.points, self.points[nearest], normals, normals[nearest])
 
     def described(self, unit: float, size: int, config: SearchConfig) -> Described:
-        """The cloud as the search takes it, padded to `size` rows; `unit` in that of the level."""
+        """The cloud as the search takes it, padded to `size` rows; `unit` is in units of the level."""
         key = (unit, size, config)
         if key not in self._described:
             normals = None if self.normals is None else padded(self.normals, size)[0]
@@ -78,12 +78,12 @@ class Level:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prepared:
-    """A cloud made ready by `jaxreg.prepare`, for any number of registrations.
+    """A cloud prepared by `jaxreg.prepare`, for any number of registrations.
 
     `points` are the distinct finite points in lexicographic order, around `centre` in units of
-    `radius` (root mean square), so that neither the order nor the repetition of the rows, nor offset
-    and unit, change a result. `kept` says which rows of the input are finite, and ``points[row]`` are
-    the kept rows in their own order. `fine` and `coarse` hold at most `config.refine_points` and
+    `radius` (root mean square), so order and repetition of the rows, offset and unit do not change
+    a result. `kept` says which rows of the input are finite, and ``points[row]`` are the kept rows
+    in their own order. `fine` and `coarse` have at most `config.refine_points` and
     `config.search_points` points.
     """
 
@@ -100,11 +100,11 @@ class Prepared:
 
     @functools.cached_property
     def tree(self) -> cKDTree:
-        """Of all points; unbalanced, which is built in a third of the time and searched as fast."""
+        """Over all points; unbalanced, which is built in a third of the time and searched as fast."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     def thinned(self, size: float) -> Level:
-        """`coarse` averaged in cubes of edge `size`, which has the unit of the input."""
+        """`coarse` averaged in cubes of edge `size` (unit of the input)."""
         if size not in self._thinned:
             points = voxel_reduced(self.coarse.points, size / self.radius)
             self._thinned[size] = _level(points, self.points, self.normals, self.coarse.k)
@@ -131,15 +131,15 @@ def prepare(
     config: RegisterConfig | None = None,
     name: str = "cloud",
 ) -> Prepared:
-    """All that registration needs to know of one cloud, made once: give it to `jaxreg.register`.
+    """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
-    `cloud` is (n, 3), anything numpy understands. `normals` (n, 3), of any length and sign, replace
-    those that the points give; zero where unknown. `config` must be that of the registration, and
-    `name` is what messages call the cloud.
+    `cloud` is array-like (n, 3). `normals` (n, 3), of any length and sign, replace the computed
+    ones; give zeros where unknown. `config` must be that of the registration, and `name` is how
+    messages refer to the cloud.
 
     Raises:
-      ValueError: a cloud that is not numeric (n, 3) with three finite points or more (the message
-        names the row), or normals of another shape or not finite.
+      ValueError: the cloud is not a numeric (n, 3) array with at least three finite points (the
+        message names the row), or the normals have another shape or are not finite.
     """
     config = RegisterConfig() if config is None else config
     array, kept = check_points(cloud, name, nonfinite=nonfinite)
@@ -158,9 +158,9 @@ def prepare(
 
 
 def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]:
-    """The coarse levels of both clouds, the denser one thinned where their spacings are unalike.
+    """The coarse levels of both clouds, the denser one thinned if their spacings differ.
 
-    What is counted around a point depends on the density, and clouds are compared by such counts.
+    Counts around a point depend on the density, and clouds are compared by such counts.
     """
     clouds = (source, reference)
     spacings = [cloud.coarse.spacing * cloud.radius for cloud in clouds]
@@ -173,7 +173,7 @@ def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]
 
 
 def in_steps(value: float) -> float:
-    """The nearest of the values that pairs are compared at, which are a fifth apart; 0 stays."""
+    """The nearest of the values at which pairs are compared, a fifth apart; 0 stays."""
     return 2.0 ** (round(_STEPS * math.log2(value)) / _STEPS) if value > 0 else 0.0
 
 
@@ -191,9 +191,9 @@ def voxel_reduced(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.nda
 
 
 def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "v 3"]:
-    """At most `most` points that cover the cloud evenly; the cloud itself where it is small enough.
+    """At most `most` points that cover the cloud evenly; the cloud itself if it is small enough.
 
-    Voxel means with the smallest voxel that does it, to a few per cent.
+    Voxel means with the smallest voxel that suffices, to a few per cent.
     """
     if len(points) <= most:
         return points
@@ -227,7 +227,7 @@ def nearest(
 def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> float:
     """How far apart neighbouring points of the surface are: the median distance to the 4th nearest.
 
-    On a surface covered by squares of edge a, one point each, this is about a; 0 of a single point.
+    On a surface covered by squares of edge a, one point each, this is about a; 0 for a single point.
     """
     k = min(4, len(points) - 1)
     if k < 1:
@@ -248,7 +248,7 @@ def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k:
 
 
 def _distinct(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The distinct rows in lexicographic order, where each stands first, and which one every row is."""
+    """The distinct rows in lexicographic order, the first row of each, and which one every row is."""
     points = points + 0.0  # -0.0 and 0.0 are one number.
     order, tied = _lexicographic(points)
     ordered = points[order]
@@ -263,10 +263,10 @@ def _distinct(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _lexicographic(points: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The order of the rows by x, then y, then z, and whether any two have one x.
+    """The order of the rows by x, then y, then z, and whether any two share an x.
 
-    Coordinates of scans hardly repeat, so that one sort by x leaves little to do: a third of the
-    time of a lexsort (and numpy.unique on rows takes several times as long).
+    Coordinates of scans rarely repeat, so one sort by x leaves little to do: a third of the time of
+    a lexsort (and numpy.unique on rows takes several times as long).
     """
     order = np.argsort(points[:, 0], kind="stable")
     x = points[order, 0]
@@ -281,16 +281,16 @@ def _lexicographic(points: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def _from_corner(points: np.ndarray) -> list[np.ndarray]:
-    """The three coordinates above their smallest values, each contiguous: three times as fast."""
+    """The three coordinates minus their smallest values, each contiguous: three times as fast."""
     return [column - column.min() for column in np.ascontiguousarray(points.T)]
 
 
 def _cubes(columns: list[np.ndarray], size: float) -> Int[np.ndarray, "n"]:
-    """A number for the cube of edge `size` that every point lies in, in lexicographic order."""
+    """For every point, the number of its cube of edge `size`, in lexicographic order."""
     cells = [(column / size).astype(np.int64) for column in columns]
     extent = [int(cell.max()) + 1 for cell in cells]
     if math.prod(extent) > _CUBES:
-        # Ranks in place of coordinates: of cells far apart the number itself would overflow.
+        # Ranks instead of coordinates: the number itself would overflow for cells far apart.
         ranked = [np.unique(cell, return_inverse=True) for cell in cells]
         cells = [rank for _, rank in ranked]
         extent = [len(values) for values, _ in ranked]

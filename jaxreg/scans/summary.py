@@ -1,4 +1,4 @@
-"""A registration in words and figures: for the terminal, for the page, and for other programs."""
+"""A registration in words and numbers: for the terminal, for the page, and for other programs."""
 
 import dataclasses
 import math
@@ -11,12 +11,12 @@ from jaxreg.scans.pair import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
 _CLOSE = 0.03
-"""Lead below which another pose is worth a word: that of a close call in the search."""
+"""Lead below which another pose is mentioned: that of a close call in the search."""
 _UNKNOWN = "not known: nothing was refined, or no surfaces are within reach"
 
 
 def verdict_line(result: ScanRegistration) -> str:
-    """Success or not, in words, with the probability."""
+    """Success or failure, in words, with the probability."""
     chance = f"probability {result.probability:.2f}"
     if result.success:
         return f"success ({chance})"
@@ -60,10 +60,10 @@ def record(result: ScanRegistration) -> dict[str, Any]:
 
 
 def _alternatives(result: ScanRegistration) -> str:
-    """How many other poses come near the chosen one, and the nearest of them."""
+    """How many other poses are nearly as good as the chosen one, and the best of them."""
     close = [other for other in result.alternatives if other.lead < _CLOSE]
     if not close:
-        return "none that comes near"
+        return "none nearly as good"
     turns = [axis_angle(other.transform.rotation @ result.rotation.T)[1] for other in close]
     listed = ", ".join(f"turned by {math.degrees(turn):.0f} deg" for turn in turns)
     return f"{len(close)} nearly as good ({listed} from this one)"
@@ -88,7 +88,7 @@ def matrix_text(matrix: Float[np.ndarray, "4 4"]) -> str:
 
 
 def axis_angle(rotation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Unit axis, and angle in [0, pi]; the z axis where nothing turns."""
+    """Unit axis, and angle in [0, pi]; the z axis if nothing turns."""
     from scipy.spatial.transform import Rotation  # start-up of programs that only import this
 
     vector = Rotation.from_matrix(rotation).as_rotvec()

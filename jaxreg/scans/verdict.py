@@ -1,4 +1,4 @@
-"""Whether two clouds agree under a pose, and the calibrated chance that the pose is right."""
+"""Whether two clouds agree under a pose, and the calibrated probability that the pose is right."""
 
 from typing import NamedTuple
 
@@ -12,20 +12,21 @@ from jaxreg.types import RigidTransform
 TRUSTED = 0.5
 """Probability from which a registration counts as a success."""
 NO_RIVAL = 0.5
-"""Where no other pose was found that differs."""
+"""If no other distinct pose was found."""
 NOT_SEARCHED = float("nan")
-"""Where no other pose was looked for: the verdict rests on the rest."""
+"""If no other pose was searched for: the verdict rests on the other evidence."""
 
 
 class Evidence(NamedTuple):
-    """What tells a right pose from a wrong one; plain numbers without unit.
+    """What the verdict is computed from; numbers without unit.
 
     `overlap` is the share of the points of both clouds within reach of the other cloud, `smaller`
     that of the cloud with the smaller share. `gap` is the median distance of such points from the
     plane of their partner, and `facing` the mean cosine of the two normals, each compared to what
     neighbours within one cloud show: 1 and 0 when the clouds are samples of one surface.
-    `constraint` is the smallest mean square change of those distances by a unit motion. `rival` is
-    how much worse, in shares of the points, the best other pose agrees; NaN where none was looked for.
+    `constraint`: how much those distances change, in the mean square, under the unit motion that
+    changes them least. `rival` is how much worse, in shares of the points, the best other pose
+    agrees; NaN if none was searched for.
     """
 
     overlap: float
@@ -98,7 +99,7 @@ def _constraint(points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 
 def probability(found: Evidence) -> float:
     """The chance that the pose is right: a logistic regression, whose constants' origin is below.
 
-    0 where the clouds leave a motion free, as planes do: no pose is the right one then.
+    0 if some motion changes nothing, as for two planes: then no pose is *the* right one.
     """
     if found.constraint < _LEAST_CONSTRAINT:
         return 0.0
@@ -108,7 +109,7 @@ def probability(found: Evidence) -> float:
 
 
 def reason(found: Evidence, weak: tuple[WeakDirection, ...]) -> str:
-    """Why a pose is not trusted: what of the evidence falls shortest of a usual right pose."""
+    """Why a pose is not trusted: the evidence that falls shortest of a usual right pose."""
     if found.constraint < _LEAST_CONSTRAINT:
         free = ", ".join(direction.name for direction in weak) or "a motion"
         return f"The surfaces leave the pose free: {free}."
@@ -127,7 +128,7 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...]) -> str:
 
 
 def features(found: Evidence) -> Float[np.ndarray, "k"]:
-    """The inputs of the regression; quantities that span decades by their logarithm.
+    """The inputs of the regression; quantities that span decades as their logarithm.
 
     Six, or five without a rival.
     """

@@ -1,7 +1,7 @@
 """Refinement of poses inside the search: coarse with a grid, fine with exact neighbours.
 
-Both weigh a pair by a Gaussian of its *distance*, whose width narrows over the iterations, so that
-what has no counterpart stops pulling although no overlap was ever estimated.
+Both weight a pair by a Gaussian of its *distance*, whose width narrows over the iterations, so
+points without a counterpart stop pulling although no overlap was ever estimated.
 """
 
 import jax
@@ -19,7 +19,8 @@ from jaxreg.types import RigidTransform
 COARSE_WIDTHS = (0.15, 0.12, 0.09, 0.07, 0.05)
 """Gaussian width of every coarse iteration, in units of the search."""
 COARSE_EPSILON = 0.1
-"""Weight of the distance along a surface, against that across it: large, since few poses are near."""
+"""Weight of the distance along a surface, relative to that across it: large, because few poses are
+near."""
 FINE_WIDTHS = (0.1, 0.07, 0.05, 0.05)
 """Gaussian width of every fine iteration, in units of the search."""
 FINE_EPSILON = 0.01
@@ -37,7 +38,7 @@ def align_coarse(
 ) -> RigidTransform:
     """One Gauss-Newton step for each of `widths`; neighbours from the grid, source to reference.
 
-    The metric ``n n^T + epsilon I`` is that of point to plane, held where planes would slide.
+    The metric ``n n^T + epsilon I`` is that of point to plane, with a hold where planes would slide.
     """
     outer = reference.normals[:, :, None] * reference.normals[:, None, :]
     metric = outer + epsilon * jnp.eye(3, dtype=outer.dtype)[None]
@@ -72,7 +73,7 @@ def align_fine(
     covariances = surface_covariances(source.normals, epsilon)
     others = surface_covariances(reference.normals, epsilon)
     rows, columns = (jnp.arange(len(s.mask), dtype=jnp.int32) for s in (source, reference))
-    # Both masks count in both directions: with an empty cloud there is no pair at all.
+    # Both masks apply in both directions: with an empty cloud there is no pair at all.
     usable = jnp.any(source.mask) & jnp.any(reference.mask)
     valid = jnp.concatenate([source.mask, reference.mask]) & usable
 

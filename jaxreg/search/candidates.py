@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 class Candidates(NamedTuple):
-    """``source[source_index[c]]`` may be ``reference[reference_index[c]]``; False is no candidate."""
+    """``source[source_index[c]]`` may be ``reference[reference_index[c]]``; False: not a candidate."""
 
     source_index: Int[Array, "c"]
     reference_index: Int[Array, "c"]
@@ -16,7 +16,7 @@ class Candidates(NamedTuple):
 
 
 MATCHES = 3
-"""Most similar points of every point that become candidates, in both directions."""
+"""How many of the most similar points become candidates of a point, in both directions."""
 _MUTUAL_BONUS = 0.05
 """Added to the margin of two points that are each other's best match (cosines are in [-1, 1])."""
 
@@ -32,8 +32,8 @@ def select_candidates(
     """The `keep` clearest of the best `matches` of every row and of every column.
 
     A match is clear by its margin: how far its similarity lies above the best one that is *not*
-    among the `matches` of its row (column), plus a bonus if it is mutually the best. A match that
-    stands in both lists counts once. With fewer than `keep`, the rest is masked out.
+    among the `matches` of its row (column), plus a bonus if it is mutually the best. A match in
+    both lists counts once. With fewer than `keep`, the rest is masked out.
 
     Raises:
       ValueError: not ``1 <= matches < min(n, m)``.
@@ -41,7 +41,7 @@ def select_candidates(
     n, m = similarity.shape
     if not 1 <= matches < min(n, m):
         raise ValueError(
-            f"matches = {matches} of every point need clouds of more points, got {n} and {m}: "
+            f"matches = {matches} per point need clouds of more points, got {n} and {m}: "
             "choose 1 <= matches < min(n, m)."
         )
     keep = min(keep, (n + m) * matches)
@@ -57,7 +57,7 @@ def select_candidates(
     source = jnp.concatenate([rows, row.reshape(-1)])
     reference = jnp.concatenate([column.reshape(-1), columns])
     value = similarity[source, reference]
-    # Where nothing else is valid, the margin is that over the least of cosines.
+    # If nothing else is valid, the margin is that over the least possible cosine.
     margins = [
         (best[:, :-1] - jnp.maximum(best[:, -1:], -1)).reshape(-1) for best in (by_row, by_column)
     ]

@@ -1,8 +1,8 @@
 """Which candidates fit together: second-order spatial compatibility (SC2-PCR), with normals.
 
-A rigid motion keeps the distance of two points, the angle of their normals and the angle between a
-normal and the line that joins them. Two right candidates agree in all of these, and share more
-third candidates than two wrong ones do: ``C (C C)`` counts them (Chen et al., CVPR 2022).
+A rigid motion keeps the distance between two points, the angle between their normals, and the angle
+between a normal and the line that joins them. Two right candidates agree in all of these, and share
+more third candidates than two wrong ones do: ``C (C C)`` counts them (Chen et al., CVPR 2022).
 """
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.geometry.numerics import safe_norm, safe_sqrt
 
 DISTANCE_TOLERANCE = 0.08
-"""Change of a distance, in units of the search, at which two candidates stop being compatible."""
+"""Change of a distance, in units of the search, from which two candidates are not compatible."""
 COSINE_TOLERANCE = 0.3
 """The same for the cosines of normals and lines."""
 
@@ -42,7 +42,7 @@ def compatibility(
 
 
 def second_order(first: Float[Array, "c c"], rows: int) -> Float[Array, "rows c"]:
-    """The first `rows` of ``C (C C)``, elementwise outside.
+    """The first `rows` of ``C (C C)``, whose outer product is elementwise.
 
     Agreement, times how many third candidates both agree with.
     """
@@ -52,7 +52,7 @@ def second_order(first: Float[Array, "c c"], rows: int) -> Float[Array, "rows c"
 def spectral_weights(first: Float[Array, "*s c c"], *, steps: int = 10) -> Float[Array, "*s c"]:
     """The leading eigenvector of a non-negative matrix by power iteration, of length 1.
 
-    Where nothing agrees, all weights are equal.
+    If nothing agrees, all weights are equal.
     """
     weights = jnp.ones(first.shape[:-1], first.dtype)
     for _ in range(steps):
@@ -63,10 +63,10 @@ def spectral_weights(first: Float[Array, "*s c c"], *, steps: int = 10) -> Float
 
 
 def _invariants(points: Array, normals: Array, tolerance: float) -> tuple[Array, ...]:
-    """Of every two points: their distance, and the cosines of n_i with n_k, n_i with u, n_k with u.
+    """For every two points: their distance, and the cosines of n_i with n_k, n_i with u, n_k with u.
 
-    All sums are written out and no matrix is transposed, so that XLA makes one loop of it, four times
-    as fast as products of matrices with three columns.
+    All sums are written out and no matrix is transposed, so XLA makes one loop of it, four times as
+    fast as products of matrices with three columns.
     """
     line = [points[None, :, axis] - points[:, None, axis] for axis in range(3)]
     n_i, n_k = list(normals.T[:, :, None]), list(normals.T[:, None, :])

@@ -10,10 +10,10 @@ _COUNTS = ("candidates", "seeds", "screened", "aligned")
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """What may be set of registration without a start (`jaxreg.search`).
+    """Settings of registration without a start (`jaxreg.search`).
 
-    Lengths are in units of the search: a usual shape fills the unit sphere in them. What was fitted,
-    and nobody needs to change, is a constant beside the code that uses it.
+    Lengths are in units of the search, in which a usual shape fills the unit sphere. Fitted values,
+    which nobody needs to change, are constants next to the code that uses them.
 
     Raises:
       ValueError: a value is not positive.
@@ -27,9 +27,9 @@ class SearchConfig:
     candidates: int = 768
     """Candidate correspondences kept, the clearest first."""
     seeds: int = 512
-    """How many of these, the clearest first, give a pose each."""
+    """How many of these, the clearest first, each give a pose."""
     screened: int = 64
-    """Distinct poses that are aligned coarsely, those of the largest overlap first."""
+    """Distinct poses that are aligned coarsely, those with the largest overlap first."""
     aligned: int = 8
     """Distinct poses that are aligned with exact neighbours and ranked."""
     final: RefineConfig = RefineConfig(
@@ -46,7 +46,7 @@ class SearchConfig:
     grows as the points of sparse clouds lie farther apart; a cloud of fewer points has a smaller k."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError where a value is out of range."""
+        """Raise ValueError if a value is out of range."""
         if not self.radii:
             raise ValueError("radii is empty: give one radius or more, in units of the search.")
         values = {name: getattr(self, name) for name in _COUNTS}
@@ -59,9 +59,9 @@ class SearchConfig:
 
 @dataclasses.dataclass(frozen=True)
 class FeatureConfig:
-    """What the inputs of a network of features depend on, in units of the search.
+    """What the inputs of a feature network depend on, in units of the search.
 
-    It stands in the card beside the weights, which fit no other inputs.
+    It is in the card of the weights, which do not work with other inputs.
     """
 
     radii: tuple[float, ...]

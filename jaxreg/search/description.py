@@ -1,7 +1,7 @@
-"""What the search knows of one cloud, made once, and of two clouds before it moves any.
+"""What the search knows about one cloud, computed once, and about two clouds before it moves one.
 
-A cloud that is registered with many others is described once: everything here that takes
-time depends on one cloud alone.
+A cloud that is registered with many others is described once: everything slow here depends on one
+cloud alone.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ _DEFAULT = SearchConfig()
 
 
 class Described(NamedTuple):
-    """A cloud in units of the search, and everything of it that no other cloud plays a role in.
+    """A cloud in units of the search, with everything that depends on it alone.
 
     `normals` are of length 1 and arbitrary sign, `openness` says where the surface ends,
     `features` are the raw `descriptors.moments`, `spacing` is the mean distance to the nearest
@@ -62,11 +62,11 @@ def describe(
     normals: Float[Array, "n 3"] | None = None,
     config: SearchConfig = _DEFAULT,
 ) -> Described:
-    """A cloud as `search_described` takes it.
+    """Describe a cloud, as `search_described` takes it.
 
     The points must lie around the origin: subtract their centroid first. Both clouds of a pair need
     one `unit` (in the unit of the points); twice the root mean square radius is right for most. It
-    may be a traced scalar. `normals` of length 1 are taken in place of computed ones.
+    may be a traced scalar. Given `normals`, of length 1, replace computed ones.
 
     A constant of every derivative: which points match is a discrete choice.
 
@@ -100,8 +100,8 @@ def describe(
 def compare(source: Described, reference: Described, *, network: Network | None = None) -> Compared:
     """Features of both clouds in common units, and their cosines.
 
-    These features are the moments, or what `network` makes of them; the local ones of the surfaces
-    are the moments at the first radius.
+    These features are the moments, or what `network` computes from them; the local ones of the
+    surfaces are the moments at the first radius.
 
     Raises:
       ValueError: the clouds were described with different radii, or `network` was trained for others.
@@ -130,7 +130,7 @@ def compare(source: Described, reference: Described, *, network: Network | None 
 
 
 def check_cloud(name: str, points: Array, mask: Array | None) -> None:
-    """Raises ValueError unless `points` is (n, 3) of floats, n >= 1, and `mask` (n,) of bools."""
+    """Raise ValueError unless `points` is (n, 3) of floats, n >= 1, and `mask` (n,) of bools."""
     if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
         raise ValueError(
             f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, and use "

@@ -1,7 +1,7 @@
 """Multi-scale moment descriptors: how the points, and their normals, lie around every point.
 
-Everything is a Gaussian-weighted mean over the whole cloud, so that one product of the weights
-(n, n) with a table (n, 21) gives every point's statistics: no neighbour lists, no histograms.
+Everything is a Gaussian-weighted mean over the whole cloud, so one product of the weights (n, n)
+with a table (n, 21) gives every point's statistics: no neighbour lists, no histograms.
 """
 
 import jax
@@ -15,7 +15,7 @@ from jaxreg.geometry.numerics import safe_norm, safe_sqrt
 NORMAL_RADIUS = 0.15
 """Radius of the neighbourhood of a normal, in units of the search."""
 OPENNESS_RADIUS = 0.3
-"""Radius at which a surface is seen to be open, in units of the search."""
+"""Radius at which openness is measured, in units of the search."""
 INVARIANTS = 16
 """Features of a point at each radius."""
 _SMALLEST_NORM = 1e-9
@@ -54,16 +54,16 @@ def moments(
     With weights ``exp(-|p_j - p|^2 / (2 (r/2)^2))`` let ``o`` be the offset from the point p to the
     weighted centroid, C the covariance of the points, ``N = E[n_j n_j^T]`` that of the normals, and
     ``v_k`` the eigenvectors of C. The invariants are the square roots of the eigenvalues of C over
-    r, ``|o . v_k| / r``, the roots of the eigenvalues of N and of ``v_k^T N v_k``, and how they lie
-    to the point's own normal n: ``|o . n| / r``, ``|o - n (o . n)| / r``, ``sqrt(n^T C n) / r``,
-    ``sqrt(n^T N n)`` (normals have no sign, so each enters squared).
+    r, ``|o . v_k| / r``, the roots of the eigenvalues of N and of ``v_k^T N v_k``, and their
+    relation to the point's own normal n: ``|o . n| / r``, ``|o - n (o . n)| / r``,
+    ``sqrt(n^T C n) / r``, ``sqrt(n^T N n)`` (normals have no sign, so each enters squared).
 
     The points should lie around the origin, since C is a difference of means of squares. A constant
     of every derivative: which points match is a discrete choice.
     """
     points, normals, squared = jax.lax.stop_gradient((points, normals, squared))
     table = jnp.concatenate([points, _outer(points), _outer(normals)], axis=1)
-    # One scale after the other: a third quicker than all at once, whose weights (n, n) leave the cache.
+    # One scale after the other: a third faster than all at once, whose weights (n, n) leave the cache.
     blocks = jax.lax.map(
         lambda radius: _at_scale(points, normals, squared, table, mask, radius),
         jnp.asarray(radii, points.dtype),
@@ -113,7 +113,7 @@ def openness(
 
 
 def mean_spacing(squared: Float[Array, "n n"], mask: Bool[Array, "n"]) -> Float[Array, ""]:
-    """Mean distance from a point to the nearest other one; 0 where there are no two points."""
+    """Mean distance from a point to the nearest other one; 0 with fewer than two points."""
     other = mask[None, :] & ~jnp.eye(len(mask), dtype=bool)
     nearest = jnp.min(jnp.where(other, squared, jnp.inf), axis=1)
     count = jnp.sum(mask)

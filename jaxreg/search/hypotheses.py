@@ -16,13 +16,13 @@ from jaxreg.search.surface import Surface
 from jaxreg.types import RigidTransform
 
 CONSENSUS_SIZE = 12
-"""Other candidates that a pose is computed from."""
+"""How many other candidates a pose is computed from."""
 SCREEN_WIDTH = 0.06
 """Width of the Gaussian overlap that poses are screened by, in units of the search."""
 
 
 class Separation(NamedTuple):
-    """When two poses differ.
+    """When two poses count as different.
 
     They turn by more than `angle` (radians) from each other, or take the origin to places more than
     `distance` apart (units of the search).
@@ -45,7 +45,7 @@ def pose_hypotheses(
     It is that of the candidate and of the `consensus_size` others that agree with it best, ranked by
     second-order compatibility; the weights of the Procrustes solution are the leading eigenvector of
     the compatibility among them. The seeds are the clearest candidates, not those that agree with
-    most others: where nine of ten are wrong, that loses the right ones.
+    most others: when nine in ten are wrong, that loses the right ones.
     """
     among = second_order(first, seeds)
     _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, consensus_size))
@@ -64,7 +64,7 @@ def screen(
     *,
     width: float = SCREEN_WIDTH,
 ) -> Float[Array, "s"]:
-    """Share of the source that a pose lays on the reference, in [0, 1]: cheap, and one way.
+    """Share of the source that a pose puts on the reference, in [0, 1]: cheap, in one direction.
 
     Mean of ``exp(-d^2 / (2 width^2)) (n . m)^2`` over the source points; `grid` is of the reference.
     """
@@ -88,7 +88,7 @@ def pick_distinct(
 ) -> Int[Array, "count"]:
     """The best pose, the best of those that differ from it, and so on.
 
-    The origin should be the centroid of the source. When no pose is left that differs from all those
+    The origin should be the centroid of the source. If no pose is left that differs from all those
     chosen, a second round begins; poses that are not `allowed` take part from the second round on.
     """
     flat = poses.rotation.reshape(-1, 9)

@@ -1,7 +1,7 @@
-"""Learned features: what the moments say of a point, passed along the surface around it.
+"""Learned features: the moments of a point, passed along the surface around it.
 
-They are invariant to rigid motion as the moments are, since nothing enters but these, lengths and
-cosines. Trained on pairs of procedural shapes by `python -m research.train_features`.
+They are invariant to rigid motion like the moments, because only these, lengths and cosines enter.
+Trained on pairs of procedural shapes by `python -m research.train_features`.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ _EDGE = 4
 
 
 def init_network(key: PRNGKeyArray, inputs: int = len(_DEFAULT.radii) * INVARIANTS) -> Network:
-    """Random weights of `learned_features` of that many moments of a point, Glorot uniform."""
+    """Random weights of `learned_features` for that many moments per point, Glorot uniform."""
     sizes = {"lift": (inputs + 1, _WIDTH), "last": (_WIDTH, _WIDTH)}
     for name, _, _ in _ROUNDS:
         sizes |= {
@@ -48,38 +48,38 @@ def init_network(key: PRNGKeyArray, inputs: int = len(_DEFAULT.radii) * INVARIAN
 
 
 def feature_config(config: SearchConfig = _DEFAULT) -> FeatureConfig:
-    """What a network learns from when it is trained for this search."""
+    """What a network is trained on for this search."""
     return FeatureConfig(config.radii, NORMAL_RADIUS, OPENNESS_RADIUS)
 
 
 def load_features(name: str = "features", *, config: SearchConfig = _DEFAULT) -> Network:
-    """The weights (numpy arrays) of a network of features, for the `network` of `register_global`.
+    """Load the weights (numpy arrays) of a feature network, for the `network` of `register_global`.
 
-    `name` is that of released weights, or the path of your own without the suffix.
+    `name` is that of released weights, or the path of your own without a suffix.
 
     Raises:
-      ValueError: there are no such weights, they are not those of such a network, or they were trained
-        for a search with other descriptors than that of `config`.
+      ValueError: there are no such weights, they are not those of a feature network, or they were
+        trained for a search with other descriptors than that of `config`.
     """
     network, card = load_arrays(name)
     trained = card["config"]
     for field, value in dataclasses.asdict(feature_config(config)).items():
         if field not in trained:
             raise ValueError(
-                f"the weights '{name}' are not those of features of the search: their card says "
-                f"nothing of {field}. The released ones are called 'features'."
+                f"the weights '{name}' are not those of a feature network: their card says "
+                f"nothing about {field}. The released ones are called 'features'."
             )
         if not np.array_equal(trained[field], value):
             raise ValueError(
-                f"the weights '{name}' were trained with {field} = {trained[field]}, and this search "
-                f"has {value}: set it as it was, or train others (research/train_features.py)."
+                f"the weights '{name}' were trained with {field} = {trained[field]}, but this search "
+                f"has {value}: set it as in training, or train others (research/train_features.py)."
             )
     check_network(network, len(config.radii) * INVARIANTS)
     return network
 
 
 def check_network(network: Network, inputs: int) -> None:
-    """Raises ValueError unless `network` takes `inputs` moments of a point."""
+    """Raise ValueError unless `network` takes `inputs` moments per point."""
     expected = jax.eval_shape(lambda: init_network(jax.random.key(0), inputs))
     for name, weights in expected.items():
         if name not in network:
@@ -88,8 +88,8 @@ def check_network(network: Network, inputs: int) -> None:
             )
         if network[name].shape != weights.shape:
             raise ValueError(
-                f"the weights '{name}' of the network have shape {network[name].shape} and should have "
-                f"{weights.shape} for {inputs} moments of a point: choose as many radii in "
+                f"the weights '{name}' of the network have shape {network[name].shape}, but need "
+                f"{weights.shape} for {inputs} moments per point: choose as many radii in "
                 "SearchConfig as the network was trained with."
             )
 
@@ -102,7 +102,7 @@ def learned_features(
     normals: Float[Array, "n 3"],
     mask: Bool[Array, "n"] | None = None,
 ) -> Float[Array, "n c"]:
-    """Features of length 1, whose cosines say how alike two points and their surroundings are.
+    """Features of length 1, whose cosines measure how alike two points and their surroundings are.
 
     `moments` are those of `standardized`. Two rounds of messages over edges (i, j) follow, to the 16
     nearest points and to 16 of the 64 nearest: ``h_i += A gelu(B [max_j m_ij, mean_j m_ij])`` with

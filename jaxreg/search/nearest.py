@@ -12,7 +12,7 @@ from jaxreg.geometry.neighbors import squared_distances
 CELLS = 24
 """Cells of a grid along each axis: a cell of a usual shape is about a tenth of its radius."""
 _FAR = 1e4
-"""Where padding is put, in units of the clouds."""
+"""Coordinate at which padding is placed, in units of the clouds."""
 
 
 class NearestGrid(NamedTuple):
@@ -26,20 +26,20 @@ class NearestGrid(NamedTuple):
 def nearest_packed(
     queries: Float[Array, "q 3"], points: Float[Array, "m 3"], mask: Bool[Array, "m"]
 ) -> Int[Array, "q"]:
-    """Index of the nearest valid point of every query, right but for near-equal distances.
+    """Index of the nearest valid point of every query, exact except for near-equal distances.
 
     The index replaces the last ``log2(m)`` bits of the squared distance, which then orders as
     before: one vectorised minimum instead of an argmin, ten times faster on a CPU. With 1024 points
     in float32, squared distances that differ by less than 1/8000 count as equal.
     """
     points, queries = jax.lax.stop_gradient((jnp.where(mask[:, None], points, _FAR), queries))
-    # Else XLA moves the queries anew for every point.
+    # Otherwise XLA moves the queries again for every point.
     queries = written_out(queries)
     return _row_of_minimum(squared_distances(points, queries))
 
 
 def _row_of_minimum(squared: Float[Array, "m q"]) -> Int[Array, "q"]:
-    """Of every column: minima over columns are twice as fast as over rows."""
+    """For every column: minima over columns are twice as fast as over rows."""
     m = squared.shape[0]
     integer = jnp.int32 if squared.dtype == jnp.float32 else jnp.int64
     low = (1 << max(m - 1, 1).bit_length()) - 1
@@ -62,7 +62,7 @@ def nearest_grid(
     cell = jnp.maximum((high - low) / cells, 1e-6)
     steps = jnp.arange(cells, dtype=points.dtype) + 0.5
     points = jax.lax.stop_gradient(jnp.where(mask[:, None], points, _FAR))
-    # Of a lattice, the squared distances are sums of three tables.
+    # On a lattice, the squared distances are sums of three tables.
     x, y, z = ((points[:, k, None] - (low[k] + cell[k] * steps)[None, :]) ** 2 for k in range(3))
     across = (y[:, :, None] + z[:, None, :]).reshape(len(points), -1)
     index = jax.lax.map(lambda along: _row_of_minimum(along[:, None] + across), x.T)
@@ -70,7 +70,7 @@ def nearest_grid(
 
 
 def lookup(grid: NearestGrid, queries: Float[Array, "*q 3"]) -> Int[Array, "*q"]:
-    """About the nearest point: the one nearest to the centre of the query's cell.
+    """The nearest point, approximately: the one nearest to the centre of the query's cell.
 
     A query outside the box takes the nearest cell of the box.
     """

@@ -1,6 +1,6 @@
 """Registration without a start, from two clouds to a pose: describe, match, hypothesise, align, rank.
 
-Pure functions of one pair: compose them with `jax.jit`, `jax.vmap` and `jax.grad`.
+Pure functions of one pair: use them under `jax.jit`, `jax.vmap` and `jax.grad`.
 """
 
 import dataclasses
@@ -37,20 +37,19 @@ def register_global(
     max_angle: Float[Array, ""] | float = math.pi,
     config: SearchConfig = _DEFAULT,
 ) -> GlobalRegistration:
-    """The pose of the source in the frame of the reference, from any start.
+    """Register two clouds without a start: the pose of the source in the frame of the reference.
 
-    Points are matched by their moments, without learning; or, given a `network`
-    (`jaxreg.search.load_features`), by what it makes of these; or by a `similarity` of your own, the
-    cosines in [-1, 1] of any features.
+    Points are matched by moments of the surface around them, by learned features (`network`, from
+    `jaxreg.load_features`), or by your own `similarity`, the cosines in [-1, 1] of any features.
 
     `correspondences[i]` is the reference point nearest to source point i under the pose;
     `confidence[i]` is ``exp(-d^2 / 2 w^2)`` of its distance d, with w `ranking.NEAR_WIDTH` units of
-    the search. The pose is differentiable in both clouds through the last refinement alone: the
+    the search. The pose is differentiable in both clouds, through the last refinement only: the
     search is discrete.
 
-    `max_angle` (radians) bounds how far the clouds may be turned, which settles symmetric shapes; where
-    the search finds no pose within it, the best of all is returned. `score` is that of `ranking`, of
-    the pose before the last refinement.
+    `max_angle` (radians) bounds the rotation, which decides between the poses of a symmetric shape;
+    if the search finds no pose within it, the best of all is returned. `score` is that of
+    `ranking`, of the pose before the last refinement.
 
     Raises:
       ValueError: a cloud is not (n, 3) of floats or has fewer than four rows, a mask or the similarity
@@ -83,10 +82,9 @@ def search_poses(
     max_angle: Float[Array, ""] | float = math.pi,
     config: SearchConfig = _DEFAULT,
 ) -> Search:
-    """The poses of the search before the last refinement; arguments and errors as `register_global`.
+    """The poses of the search before the last refinement; arguments and errors of `register_global`.
 
-    `also` is a pose that is tried beside those found. Poses that turn by more than `max_angle`
-    (radians) are not allowed.
+    `also`: one more pose to try. Poses that turn by more than `max_angle` (radians) are not allowed.
     """
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     if also is not None:
@@ -112,9 +110,9 @@ def enter(
     *,
     unit: float | None = None,
 ) -> tuple[frame.Frame, Float[Array, "n 3"], Float[Array, "m 3"]]:
-    """Both clouds about their centroids in units of the search, and the frame that leads back.
+    """Both clouds about their centroids in units of the search, and the frame to undo that.
 
-    `unit` is `SearchConfig.unit`. Errors as `register_global`.
+    `unit` is `SearchConfig.unit`. Raises what `register_global` raises.
     """
     check_cloud("source", source, source_mask)
     check_cloud("reference", reference, reference_mask)
@@ -130,7 +128,7 @@ def _refined(
     sparsity: Array,
     config: RefineConfig,
 ) -> RigidTransform:
-    """The pose after the last refinement, through which alone it is differentiable."""
+    """The pose after the last refinement, the only part through which it is differentiable."""
     k = min(config.k, *(len(cloud) - 1 for cloud in clouds))
     return refine(
         *clouds,
@@ -149,7 +147,7 @@ def _registration(
     masks: tuple[Array, Array],
     score: Array,
 ) -> GlobalRegistration:
-    """The result in the frame and unit of the input; the identity where a cloud has no point."""
+    """The result in the frame and unit of the input; the identity if a cloud has no point."""
     (source, reference), (source_mask, reference_mask) = clouds, masks
     valid = jnp.any(source_mask) & jnp.any(reference_mask)
     identity = rigid.identity(source.dtype)

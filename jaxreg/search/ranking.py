@@ -1,4 +1,4 @@
-"""Which of several aligned poses is right: what agrees, and what speaks against.
+"""Which of several aligned poses is right: what speaks for a pose, and what against it.
 
 At low overlap the pose with the smallest residual, or the largest overlap, is often a flip of a
 nearly symmetric shape. Two things speak against a flip. Its surfaces meet only roughly: points lie
@@ -8,8 +8,8 @@ there too, whatever cut the clouds. So the score of a pose is
 
     score = match + WEIGHT_DESCRIPTOR descriptor - PENALTY_INTERIOR interior - PENALTY_GAP gap
 
-of the terms of `ScoreTerms`, and of poses whose scores lie less than CLOSE_CALL_MARGIN below the
-best one's, the one with the largest ``score + WEIGHT_PLANE plane`` is taken. The three weights of
+of the terms of `ScoreTerms`; among poses whose scores lie less than CLOSE_CALL_MARGIN below the
+best one's, the one with the largest ``score + WEIGHT_PLANE plane`` is chosen. The three weights of
 the score were fitted to rank 32 poses of pairs of procedural shapes (crops of 70 and 50 %).
 """
 
@@ -34,15 +34,16 @@ BOUNDARY_OPENNESS = 0.25
 DENSE_SPACING = 0.035
 """Mean distance to the nearest point, in units of the search, up to which a cloud counts as dense."""
 WEIGHT_DESCRIPTOR = 0.33
-"""Of a near point around which the surfaces look alike, against one that matches."""
+"""Weight of a near point around which the surfaces look alike, relative to one that matches."""
 PENALTY_INTERIOR = 1.8
-"""Of two near points in the interior of both surfaces, which should match and not only be near."""
+"""Weight of two near points in the interior of both surfaces, which should match, not only be
+near."""
 PENALTY_GAP = 4.1
-"""Of a point that lies beside the interior of the other surface, where that should have points."""
+"""Weight of a point just off the interior of the other surface, which should have points there."""
 CLOSE_CALL_MARGIN = 0.03
 """Poses that score less than this below the best one are a close call."""
 WEIGHT_PLANE = 0.25
-"""In a close call: of a point that lies on the other surface's plane to a third of PLANE_WIDTH."""
+"""In a close call: weight of a point on the other surface's plane to a third of PLANE_WIDTH."""
 
 
 class ScoreTerms(NamedTuple):
@@ -102,8 +103,8 @@ def score_terms_by_grid(
 ) -> ScoreTerms:
     """About `score_terms`, of every `step`-th point and with the nearest points of the two grids.
 
-    A table is read where the other searches, so it is much faster: enough to drop poses that are far
-    from the best. `grids` are those of the source and of the reference.
+    It reads a table where `score_terms` searches, so it is much faster: enough to drop poses that
+    are far from the best. `grids` are those of the source and of the reference.
     """
     moved = move(pose, thinned(source, step))
     back = move(rigid.inverse(pose), thinned(reference, step))
@@ -120,7 +121,7 @@ def move(pose: RigidTransform, surface: Surface) -> Surface:
 
 
 def score_of(terms: ScoreTerms) -> Float[Array, "..."]:
-    """The score of a pose, the larger the better: see the head of this file."""
+    """The score of a pose, larger is better: see the head of this file."""
     against = PENALTY_INTERIOR * terms.interior + PENALTY_GAP * terms.gap
     return terms.match + WEIGHT_DESCRIPTOR * terms.descriptor - against
 
@@ -128,10 +129,10 @@ def score_of(terms: ScoreTerms) -> Float[Array, "..."]:
 def break_ties(
     score: Float[Array, "s"], plane: Float[Array, "s"], allowed: Bool[Array, "s"] | None = None
 ) -> Float[Array, "s"]:
-    """The scores, changed in a close call by how much better than in the best pose the planes agree.
+    """The scores, changed in a close call by how much better the planes agree than in the best pose.
 
-    Sides of an object that differ by a small part score alike. Added to all scores and not only in
-    close calls, the term gains less. Poses that are not `allowed` take no part.
+    Sides of an object that differ by a small part score alike. Added to all scores instead of only
+    in close calls, the term gains less. Poses that are not `allowed` take no part.
     """
     if allowed is None:
         allowed = jnp.ones(score.shape[0], bool)

@@ -1,7 +1,7 @@
 """The stages of the search, from two described clouds to ranked poses.
 
-Many poses go in and few come out of each, at growing cost: hypotheses from matches, screened by their
-overlap, aligned coarsely, chosen by a cheap score, aligned finely, ranked by the score.
+Many poses go into each stage and few come out, at growing cost: hypotheses from matches, screened
+by their overlap, aligned coarsely, chosen by a cheap score, aligned finely, ranked by the score.
 """
 
 import math
@@ -49,7 +49,7 @@ _ALIGNED_APART = Separation(angle=0.1, distance=0.05)
 class Search(NamedTuple):
     """The aligned poses (leading axis), the best first, with their scores (`ranking`).
 
-    Poses that turn by more than the search may are not `allowed`, and come last.
+    Poses that turn by more than the search permits are not `allowed`, and come last.
     """
 
     poses: RigidTransform
@@ -58,7 +58,7 @@ class Search(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Two clouds that are to be laid on each other, and what all stages need to know of them."""
+    """Two clouds to align, and what all stages need to know about them."""
 
     source: Surface
     reference: Surface
@@ -79,11 +79,11 @@ def search_described(
 ) -> Search:
     """`search_poses` of clouds that were described before, both in one unit.
 
-    The poses map the points of `source` to those of `reference` as they stand in these records: about
+    The poses map the points of `source` to those of `reference` as they are in these records: about
     their own origins, in units of the search. So does `also`.
 
     Raises:
-      ValueError: as `search_poses`.
+      ValueError: what `search_poses` raises.
     """
     _check_search(source, reference, similarity, also, max_angle)
     compared = compare(source, reference, network=network)
@@ -105,7 +105,7 @@ def _check_search(source: Described, reference: Described, similarity, also, max
     n, m = len(source.mask), len(reference.mask)
     if min(n, m) <= MATCHES:
         raise ValueError(
-            f"the clouds have {n} and {m} rows, and the search needs {MATCHES + 1}: give more points, "
+            f"the clouds have {n} and {m} rows, but the search needs {MATCHES + 1}: give more points, "
             "or pad smaller clouds and give masks."
         )
     if similarity is not None and similarity.shape != (n, m):
@@ -122,7 +122,7 @@ def _check_search(source: Described, reference: Described, similarity, also, max
 
 
 def check_transform(also: RigidTransform) -> None:
-    """Raises ValueError unless `also` is one rotation (3, 3) and one translation (3,)."""
+    """Raise ValueError unless `also` is one rotation (3, 3) and one translation (3,)."""
     if (also.rotation.shape, also.translation.shape) != ((3, 3), (3,)):
         raise ValueError(
             f"also must be one transform with a rotation (3, 3) and a translation (3,), got "
@@ -200,7 +200,7 @@ def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
     """The poses, the allowed ones first, then by their score, with ties broken."""
     source, reference, _, sparsity, max_angle = problem
     terms = jax.lax.map(lambda pose: score_terms(pose, source, reference, sparsity=sparsity), poses)
-    # Again, since alignment may have turned a pose out of the bounds of the search.
+    # Again, because alignment may have turned a pose out of the bounds of the search.
     allowed = _turns_less(poses, max_angle)
     score = break_ties(score_of(terms), terms.plane, allowed)
     order = jnp.lexsort((-score, ~allowed))

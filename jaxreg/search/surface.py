@@ -1,4 +1,4 @@
-"""A cloud as the stages of the search see it, with what it looks like around every point."""
+"""A cloud as the stages of the search see it, with the shape of the surface around every point."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""One HTML file that shows clouds to turn, and a registration before and after, without a network."""
+"""One interactive HTML file that shows clouds, and a registration before and after; works offline."""
 
 import base64
 import html
@@ -17,7 +17,7 @@ from jaxreg.scans.pair import ScanRegistration
 from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000
-"""Most points of a cloud on the page: 120 kB, and a frame in a few milliseconds."""
+"""Largest number of points of a cloud on the page: 120 kB, and a frame in a few milliseconds."""
 _COLOURS = ("source", "reference", "aligned", "fourth", "fifth")
 
 
@@ -29,7 +29,7 @@ def write_registration_page(
     *,
     names: tuple[str, str] = ("source", "reference"),
 ) -> None:
-    """A page with both clouds, a switch before/after, confidence as colour, figures and verdict.
+    """Write an HTML page: both clouds, a before/after switch, confidence colours, numbers, verdict.
 
     Points that are not finite are left out. Large clouds are thinned evenly for display.
     """
@@ -51,7 +51,7 @@ def write_registration_page(
 
 
 def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> None:
-    """A page with clouds as they are, all in one frame."""
+    """Write an HTML page with clouds as they are, all in one frame."""
     origin = _middle(np.concatenate([_shown(points) for points in clouds.values()]))
     shown = [
         _cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
@@ -70,7 +70,7 @@ def draw_registration(
     reference: Float[np.ndarray, "m 3"],
     result: ScanRegistration,
 ) -> None:
-    """The same as a picture: before and after from two sides, and the confidence; by `plot_pair`.
+    """The same as a picture: before and after from two sides, and the confidence; see `plot_pair`.
 
     As on the page, large clouds are thinned, and a source that is far away is brought near before
     the registration.
@@ -128,10 +128,10 @@ def _cloud(
 def brought_near(
     source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "3"]:
-    """How to shift the source for a picture of "before" in which both clouds can be seen.
+    """How to shift the source for a "before" picture that shows both clouds.
 
-    Zero unless the gap between them is wider than the clouds; else they come to touch. All points
-    must be finite.
+    Zero unless the gap between them is wider than the clouds; then they are moved until they touch.
+    All points must be finite.
     """
     centres = source.mean(axis=0), reference.mean(axis=0)
     radii = [
@@ -146,9 +146,9 @@ def brought_near(
 def _motion(
     result: ScanRegistration, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
 ) -> dict[str, Any]:
-    """The motion as a turn about the source's centroid and the way of that centroid.
+    """The motion as a turn about the source's centroid and the path of that centroid.
 
-    The page has the source shifted before the motion, and ends where it ends.
+    The page shows the source shifted before the motion, and ends where the motion ends.
     """
     axis, angle = summary.axis_angle(result.rotation)
     centre = source.mean(axis=0)
@@ -158,7 +158,7 @@ def _motion(
 
 
 def _middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Coordinates are shown relative to this: JavaScript's float32 arrays know no UTM offsets."""
+    """Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
     finite = points[np.isfinite(points).all(axis=1)]
     return (finite.min(axis=0) + finite.max(axis=0)) / 2
 
@@ -168,7 +168,7 @@ def _shown(points: np.ndarray) -> np.ndarray:
 
 
 def shown_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "k"]:
-    """The finite rows, or an even share of them where a picture needs no more."""
+    """The finite rows, or an even share of them if a picture needs no more."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(rows) <= _SHOWN:
         return rows

@@ -1,6 +1,6 @@
 """Pictures: a pair before and after registration, and the curves of a training run.
 
-Figures are made without pyplot, so that drawing needs no display and leaves no global state.
+Figures are made without pyplot, so drawing needs no display and leaves no global state.
 """
 
 from pathlib import Path
@@ -47,9 +47,9 @@ def plot_pair(
     """Draw a pair before and after registration, from two sides (PNG, PDF or SVG, by the suffix).
 
     Source blue, reference yellow, aligned source green; far points are paler. All panels have one
-    scale, and the reference stays in its place. With `truth` the title states the errors, without
-    it the motion, unless `title` is given. With `confidence` a third column shows the aligned
-    source coloured by it.
+    scale, and the reference stays in place. With `truth` the title gives the errors, without it the
+    motion, unless `title` is given. With `confidence` a third column shows the aligned source
+    coloured by it.
     """
     source, reference = np.asarray(source, np.float64), np.asarray(reference, np.float64)
     rotation, translation = (np.asarray(x, np.float64) for x in transform)
@@ -90,7 +90,7 @@ def draw_clouds(axes: Axes, clouds: list, view: tuple[float, float], limits: np.
     points = project(np.concatenate([cloud for cloud, _ in clouds]), view)
     colors = np.concatenate([np.broadcast_to(color, cloud.shape) for cloud, color in clouds])
     near = (points[:, 2] - low[2]) / extent[2]
-    # A point of the first cloud shows as a rim behind a point of the second that it coincides with.
+    # A point of the first cloud shows as a rim behind a coincident point of the second.
     rim = np.arange(len(points)) < len(clouds[0][0]) * (len(clouds) > 1)
     order = np.argsort(near - 0.05 * rim)
     size = np.clip(8000 / len(points), 1, 20) * np.where(rim, 2.6, 1.6)
@@ -119,7 +119,7 @@ def plot_curves(metrics: str | Path, path: str | Path) -> None:
     """Draw the losses and the validation errors of a `metrics.jsonl` over the steps, as PNG.
 
     Raises:
-      ValueError: as `read_metrics`.
+      ValueError: what `read_metrics` raises.
     """
     _curves(read_metrics(metrics)).savefig(path, dpi=150, facecolor="white")
 
@@ -131,12 +131,13 @@ def _curves(columns: dict[str, np.ndarray]) -> Figure:
     columns.pop("gradient_norm", None)
     figure = Figure(figsize=(15, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    # A line through one point is nothing to see.
+    # A line through one point is invisible.
     marker = "." if len(steps) < 10 else ""
     for name, values in columns.items():
         width = 2 if name == "loss" else 1
         left.plot(*_binned(steps, values), marker=marker, label=name.replace("_", " "), lw=width)
-    # A mean surprise below zero (the entries of G can exceed 1) has no place on a logarithmic axis.
+    # A mean surprise below zero (the entries of G can exceed 1) cannot be shown on a logarithmic
+    # axis.
     left.set(title="training loss and its terms", xlabel="step")
     left.set_yscale("symlog", linthresh=1e-2)
     for name, label in _VALIDATION.items():

@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: the newest and the best state, by Orbax.
+"""Checkpoints of a training run: the latest and the best state, with Orbax.
 
 Released weights are in `weights.released`.
 """
@@ -38,7 +38,7 @@ class Run:
         )
 
     def save(self, step: int, state: Any, error: float) -> None:
-        """Save as the newest state and, when `error` is the lowest so far, as the best."""
+        """Save as the latest state and, if `error` is the lowest so far, as the best."""
         arguments = ocp.args.Composite(
             state=ocp.args.StandardSave(state),
             config=ocp.args.JsonSave(configuration.to_dict(self.config) | {"error": error}),
@@ -49,22 +49,22 @@ class Run:
         self._latest.save(step, args=arguments)
 
     def restore(self, state: Any) -> Any:
-        """The newest state of the run, or `state` when there is none.
+        """The latest state of the run, or `state` if there is none.
 
-        What was logged after it is forgotten, for it will be logged again. A run that was stopped
-        before its first checkpoint has nothing to lose: it starts anew, with any configuration.
+        Log entries after it are dropped, because they will be logged again. A run stopped before
+        its first checkpoint starts over, with any configuration.
 
         Raises:
-          ValueError: the checkpoints were made with another configuration, hold other arrays than
+          ValueError: the checkpoints were made with another configuration, have other arrays than
             `state`, or cannot be read.
         """
         newest, best = self._latest.latest_step(), self._best.latest_step()
-        # Killed during the first save, a run has a best state and no newest one.
+        # A run killed during its first save has a best state but no latest one.
         if newest is not None or best is not None:
             saved = _saved_config(self._best if newest is None else self._latest)[0]
             if saved != self.config:
                 raise ValueError(
-                    f"{self.directory} holds a run of another configuration "
+                    f"{self.directory} contains a run with another configuration "
                     f"({_difference(saved, self.config)}): choose another --workdir, or the same "
                     "values."
                 )
@@ -88,30 +88,31 @@ class Run:
         return np.inf if self._best.latest_step() is None else _saved_config(self._best)[1]
 
     def _forget_after(self, step: int) -> None:
-        """Drop logged steps that will be run again, and what a killed run left of a line."""
+        """Drop logged steps that will be run again, and the incomplete line of a killed run."""
         path = self.directory / "metrics.jsonl"
         if path.exists():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             kept = [line + "\n" for line in lines if _logged_step(line) <= step]
-            # Replaced at once: killed while it writes, this run would lose the lines of the others.
+            # Replaced in one step: if killed while it writes, this run would lose the lines of the
+            # others.
             part = path.with_suffix(".part")
             part.write_text("".join(kept), encoding="utf-8")
             part.replace(path)
 
 
 def check_place(workdir: str | Path) -> None:
-    """Raises ValueError unless `workdir` is a directory to write to, or can be made."""
+    """Raise ValueError unless `workdir` is a writable directory, or can be made."""
     directory = Path(workdir).resolve()
     place = next(path for path in (directory, *directory.parents) if path.exists())
     if not place.is_dir():
-        raise ValueError(f"{place} is a file: name a directory by --workdir.")
+        raise ValueError(f"{place} is a file: name a directory with --workdir.")
     if not os.access(place, os.W_OK | os.X_OK):
         raise ValueError(f"{place} cannot be written to: choose another --workdir.")
 
 
 @contextlib.contextmanager
 def open_run(workdir: str | Path, config: Config) -> Iterator[Run]:
-    """The run in `workdir`, made when it does not exist; closed (and written out) at the end."""
+    """The run in `workdir`, created if it does not exist; closed (and written out) at the end."""
     directory = Path(workdir).resolve()
     directory.mkdir(parents=True, exist_ok=True)
     run = Run(directory, config)
@@ -134,11 +135,11 @@ def best_config(workdir: str | Path) -> tuple[Config, float]:
 def restore_best(workdir: str | Path, wanted: dict[str, Any]) -> dict[str, Any]:
     """Parts of the best state in `workdir` as numpy arrays; nothing is written, nothing else read.
 
-    `wanted` holds, by the names of the parts in the state, trees of anything with the shapes and the
-    dtypes that they must have.
+    `wanted` maps the names of the parts to trees of anything with the shapes and dtypes that they
+    must have.
 
     Raises:
-      ValueError: there is no checkpoint, or it has other arrays than `wanted`, or it cannot be read.
+      ValueError: there is no checkpoint, it has other arrays than `wanted`, or it cannot be read.
     """
     as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
     arguments = ocp.args.PyTreeRestore(wanted, restore_args=as_numpy, partial_restore=True)
@@ -151,13 +152,13 @@ def _open_best(workdir: str | Path) -> Iterator[ocp.CheckpointManager]:
     directory = Path(workdir).resolve() / "best"
     if not directory.is_dir():
         raise ValueError(
-            f"no checkpoint in {workdir}: give the --workdir of a run of train.py that has "
+            f"no checkpoint in {workdir}: give the --workdir of a training run that has "
             "validated at least once."
         )
     with ocp.CheckpointManager(directory) as manager:
         if manager.latest_step() is None:
             raise ValueError(
-                f"{directory} holds no finished checkpoint: let train.py validate once."
+                f"{directory} contains no finished checkpoint: train until the first validation."
             )
         yield manager
 
@@ -179,7 +180,7 @@ def _restore(
     *,
     parts: Container[str] | None = None,
 ) -> Any:
-    """What `arguments` ask of the newest state. Its arrays (of `parts`) must be as `wanted`."""
+    """What `arguments` ask for of the latest state. Its arrays (of `parts`) must be as `wanted`."""
     step = manager.latest_step()
     try:
         with contextlib.closing(ocp.StandardCheckpointHandler()) as handler:
@@ -192,8 +193,8 @@ def _restore(
     except (ValueError, OSError) as error:
         reason = str(error).partition("\n")[0]
         raise ValueError(
-            f"the checkpoint in {manager.directory} cannot be read ({reason}): put a whole copy in "
-            "its place, or train again in another --workdir."
+            f"the checkpoint in {manager.directory} cannot be read ({reason}): replace it with an "
+            "intact copy, or train again in another --workdir."
         ) from error
     name = min(name for name, _ in there.items() ^ here.items())
     raise ValueError(
@@ -204,13 +205,13 @@ def _restore(
 
 
 def _arrays(tree: Any) -> dict[tuple[str, ...], str]:
-    """Dtype and shape of every array of a tree, by its path; what else a tree holds is no array."""
+    """Dtype and shape of every array of a tree, by its path; other leaves are ignored."""
     leaves = ocp.tree.to_flat_dict(tree).items()
     return {k: f"{np.dtype(x.dtype)}{list(x.shape)}" for k, x in leaves if hasattr(x, "shape")}
 
 
 def _logged_step(line: str) -> float:
-    """The step of a line of `metrics.jsonl`; infinity where a killed run left the line unfinished."""
+    """The step of a line of `metrics.jsonl`; infinity if a killed run left the line unfinished."""
     try:
         return float(json.loads(line)["step"])
     except (ValueError, TypeError, KeyError):
@@ -223,17 +224,17 @@ def _difference(saved: Config, wanted: Config) -> str:
 
 
 def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
-    """The best (averaged) variables of a run, and its configuration; the run is only read.
+    """The best (averaged) variables of a training run and its configuration. Nothing is written.
 
     Raises:
-      ValueError: there is no checkpoint in `workdir`, or it holds other arrays than a network of
-        this version, or it cannot be read.
+      ValueError: there is no checkpoint in `workdir`, it has other arrays than a network of this
+        version, or it cannot be read.
     """
     return load_best(workdir)[:2]
 
 
 def load_best(workdir: str | Path) -> tuple[Variables, Config, int]:
-    """The same, and the step. Nothing of the optimiser is read, which other versions may change."""
+    """The same, and the step. The optimiser's state is not read: other versions may change it."""
     config, _ = best_config(workdir)
     average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config.model))
     step = jax.ShapeDtypeStruct((), jnp.int32)

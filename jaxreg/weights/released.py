@@ -1,13 +1,13 @@
-"""Weights as files: plain arrays in NAME.npz, and in NAME.json a card that says how they were made.
+"""Weights as files: plain arrays in NAME.npz, and a card in NAME.json that says how they were made.
 
-One form for all of them, those of the networks and those of the search's features. NPZ is read without
-pickle and by NumPy alone, written here it holds no time, and a card beside it is read by people and by
-`git diff`. (safetensors would do the same at the price of a compiled dependency, and hide the card in
-its header.) Every card holds the `command` that made the weights, the `data` they were trained on, and
-the `config` they need; that of a network also `seed`, `step`, and the `validation` figures.
+One format for all, the networks and the search's features. NumPy alone reads NPZ, without pickle;
+written here it contains no time stamp; and people and `git diff` can read a card next to it.
+(safetensors would do the same at the price of a compiled dependency, and hide the card in its
+header.) Every card has the `command` that made the weights, the `data` they were trained on, and
+the `config` they need; that of a network also has `seed`, `step`, and the `validation` errors.
 
-Weights that come with the package are called by their name. Those of one's own are called by their path
-without the suffix, or by their name where $JAXREG_WEIGHTS names their directory.
+Weights that come with the package go by their name. Your own go by their path without a suffix, or
+by their name if $JAXREG_WEIGHTS is their directory.
 """
 
 import dataclasses
@@ -30,15 +30,15 @@ _VARIABLE = "JAXREG_WEIGHTS"
 
 
 def available_weights() -> tuple[str, ...]:
-    """Names that `load_pretrained` knows: networks of the package and of $JAXREG_WEIGHTS."""
+    """Names for `load_pretrained`: networks shipped with the package or found in $JAXREG_WEIGHTS."""
     names = {card.stem for folder in _folders() for card in folder.glob("*.json")}
     return tuple(sorted(name for name in names if "model" in load_card(name).get("config", {})))
 
 
 def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:
-    """The variables (numpy arrays) and the configuration of a network's weights.
+    """Load a network: its variables (numpy arrays) and its configuration.
 
-    `name` is one of `available_weights`, or the path of such files without their suffix.
+    `name` is one of `available_weights`, or the path of such files without a suffix.
 
     Raises:
       ValueError: there are no such weights (the message lists the names), they are not those of a
@@ -54,7 +54,7 @@ def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:
 
 
 def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays by their names, as they were saved, and the card.
+    """The arrays by name, as they were saved, and the card.
 
     Raises:
       ValueError: there are no such weights (the message lists the names), or a file is damaged.
@@ -66,19 +66,19 @@ def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def load_card(name: str) -> dict[str, Any]:
-    """How the weights were made: `command`, `data`, `config`; errors as `load_arrays`."""
+    """How the weights were made: `command`, `data`, `config`; raises what `load_arrays` raises."""
     path = _find(name).with_suffix(".json")
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read ({error}): copy it again.") from None
     if not isinstance(card, dict) or not isinstance(card.get("config"), dict):
-        raise ValueError(f"{path} is not a card of weights, without `config`: copy it again.")
+        raise ValueError(f"{path} is not a card of weights (it lacks `config`): copy it again.")
     return card
 
 
 def check_new_name(name: str, directory: str | Path) -> None:
-    """Raises ValueError unless weights can be saved as `name` in `directory`: plain and not taken.
+    """Raise ValueError unless weights can be saved as `name` in `directory`: plain and not taken.
 
     To replace weights, delete their two files first.
     """
@@ -87,7 +87,7 @@ def check_new_name(name: str, directory: str | Path) -> None:
     for folder in (Path(directory), _SHIPPED):
         if (folder / f"{name}.npz").exists():
             raise ValueError(
-                f"there are weights '{name}' already: choose another name, or delete {name}.npz and "
+                f"weights '{name}' already exist: choose another name, or delete {name}.npz and "
                 f"{name}.json in {folder} to replace them."
             )
 
@@ -114,13 +114,13 @@ def save_weights(
 
 
 def _folders() -> list[Path]:
-    """Where a name is looked for, in this order."""
+    """The directories in which a name is searched for, in this order."""
     own = os.environ.get(_VARIABLE, "").split(os.pathsep)
     return [_SHIPPED, *(Path(folder) for folder in own if folder)]
 
 
 def _find(name: str) -> Path:
-    """The path of the card of `name`, which may itself be a path without the suffix."""
+    """The path of the card of `name`, which may itself be a path without a suffix."""
     is_path = Path(name).name != name
     for folder in [Path()] if is_path else _folders():
         path = folder / f"{name}.json"
@@ -128,16 +128,16 @@ def _find(name: str) -> Path:
             return path
     if is_path:
         raise ValueError(
-            f"no weights {name}.npz with a card {name}.json: give the path of both without the suffix."
+            f"{name}.npz and {name}.json not found: give their common path without a suffix."
         )
     raise ValueError(
         f"no released weights '{name}': choose from {', '.join(available_weights()) or 'none'}, give "
-        f"the path of your own without the suffix, or set ${_VARIABLE} to their directory."
+        f"the path of your own without a suffix, or set ${_VARIABLE} to their directory."
     )
 
 
 def _nested(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The tree whose paths are the names; by hand, since Flax takes 0.2 s to import."""
+    """The tree whose paths are the names; by hand, because Flax takes 0.2 s to import."""
     tree: dict[str, Any] = {}
     for name, array in arrays.items():
         *path, leaf = name.split("/")

@@ -70,7 +70,7 @@ def test_gradient_of_the_loss_is_that_of_the_equations(rng):
     clouds = [PointCloud(x, np.ones(x.shape[:2], bool)) for x in (sources, references)]
     pairs = Pair(*clouds, RigidTransform(np.zeros((2, 3, 3)), np.zeros((2, 3))))
     # As a user compiles it: the derivative of `jnp.max`, which one writes first, is NaN where XLA
-    # computes the entries anew with another last bit, as LLVM's level 0 does (tests/conftest.py).
+    # computes the entries again with another last bit, as LLVM's level 0 does (tests/conftest.py).
     optimised = {"xla_backend_optimization_level": 3}
     ours, written = (
         jax.jit(

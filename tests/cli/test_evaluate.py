@@ -124,9 +124,15 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
             "--json nowhere/out.json",
             "nowhere/out.json: the folder nowhere does not exist: make it first",
         ),
-        ("--json c.toml", "c.toml is read or written by this command already"),
-        ("--transforms x.npz --save-pairs x.npz", "x.npz is read or written by this command"),
-        ("--save-pairs x.npz --save-transforms x.npz", "x.npz is read or written by this command"),
+        ("--json c.toml", "c.toml is already read or written by this command"),
+        (
+            "--transforms x.npz --save-pairs x.npz",
+            "x.npz is already read or written by this command",
+        ),
+        (
+            "--save-pairs x.npz --save-transforms x.npz",
+            "x.npz is already read or written by this command",
+        ),
     ],
 )
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(
@@ -184,7 +190,7 @@ def test_an_option_without_effect_is_refused(command, asked, options, message):
     status, printed, error = command(*options.split())
     assert (status, printed, asked) == (2, "", [])
     idle = options[options.rindex("--") :].replace("=", " ")
-    assert error.startswith(f"error: {idle} changes nothing here: ")
+    assert error.startswith(f"error: {idle} has no effect here: ")
     assert message in error
     assert len(error.splitlines()) == 1
 
@@ -261,7 +267,7 @@ def test_procedural_shapes_need_no_folder_of_data_sets(command, monkeypatch):
     assert command("--method", "identity")[0] == 0
     status, _, error = command("--method", "identity", "--data.name", "modelnet40")
     assert status == 2
-    assert "$JAXREG_DATA names /unmounted, which is no folder" in error
+    assert "$JAXREG_DATA is /unmounted, which is not a folder" in error
 
 
 def test_a_mistake_on_the_command_line_is_one_line(tmp_path):

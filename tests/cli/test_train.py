@@ -66,7 +66,7 @@ def test_weights_get_the_command_as_it_was_typed_and_go_where_it_says(
 def test_weights_are_not_replaced_and_that_is_said_before_the_training(train, tmp_path):
     status, message = train("--release", "modelnet40")
     assert status == 2
-    assert message.startswith("error: there are weights 'modelnet40' already")
+    assert message.startswith("error: weights 'modelnet40' already exist")
     (tmp_path / "w").mkdir()
     (tmp_path / "w" / "mine.npz").touch()
     status, message = train("--release", "mine", "--release-to", "w")
@@ -79,7 +79,7 @@ def test_after_the_training_an_error_is_one_line_and_loses_nothing(train, tmp_pa
     status, message = train("--workdir", tmp_path, work=one_step)
     assert status == 2
     assert message.startswith(f"error: {tmp_path}/curves.png: Is a directory")
-    assert f"({tmp_path} holds the whole run: the same command does the rest)" in message
+    assert f"({tmp_path} has the whole run: run the same command again to do the rest)" in message
     assert len(message.splitlines()) == 1
 
 
@@ -116,7 +116,7 @@ def test_an_interrupted_run_says_how_it_goes_on(train):
     def interrupted(config, workdir, *, root):
         raise KeyboardInterrupt
 
-    message = "interrupted: the same command goes on from the last validation\n"
+    message = "interrupted: run the same command to go on from the last validation\n"
     assert train(work=interrupted) == (130, message)
 
 

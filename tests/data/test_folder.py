@@ -1,4 +1,4 @@
-"""Files of one's own: which belong to a split, what becomes of them, and clear errors."""
+"""Your own files: which belong to a split, what becomes of them, and clear errors."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,9 @@ def test_repeated_and_non_finite_points_are_left_out(tmp_path):
     io.write_cloud(tmp_path / "b.npy", points)
     clouds, _ = folder.load(tmp_path, "train", points=30, test_share=0.5)
     assert len(np.unique(clouds[0], axis=0)) == 30
-    with pytest.raises(ValueError, match=r"a.npy holds 30 distinct points.*made from 31.*--pairs"):
+    with pytest.raises(
+        ValueError, match=r"a.npy has 30 distinct points, but pairs need 31: set --pairs"
+    ):
         folder.load(tmp_path, "train", points=31, test_share=0.5)
 
 
@@ -91,7 +93,7 @@ def test_validation_is_part_of_the_training_files(scans):
 
 def test_what_is_missing_is_named(tmp_path, scans):
     with pytest.raises(
-        ValueError, match="there is no folder .*nowhere: name yours by --data.folder"
+        ValueError, match="there is no folder .*nowhere: name yours with --data.folder"
     ):
         folder.load(tmp_path / "nowhere", "train", points=4, test_share=0.2)
     (tmp_path / "void").mkdir()
@@ -100,7 +102,7 @@ def test_what_is_missing_is_named(tmp_path, scans):
     for share in (0.0, 1.0, 0.99):
         with pytest.raises(ValueError, match=r"12 file\(s\).* leaves none on one side"):
             folder.load(scans, "test", points=4, test_share=share)
-    with pytest.raises(ValueError, match=r"no folder is named: give yours by --data.folder"):
+    with pytest.raises(ValueError, match=r"no folder given: name yours with --data.folder"):
         load_shapes(DataConfig(name="folder"), "train", points=4)
     (scans / "scan_3.pcd").write_bytes(b"broken")
     with pytest.raises(ValueError, match="scan_3.pcd"):

@@ -112,7 +112,7 @@ def test_a_share_that_leaves_nothing(share, tmp_path):
 
 def test_no_folder_is_known():
     with pytest.raises(
-        ValueError, match=r"no folder is known: give --data-root, set \$JAXREG_DATA"
+        ValueError, match=r"their folder is not known: give --data-root, set \$JAXREG_DATA"
     ):
         load_shapes(DataConfig(), "train", points=8)
 
@@ -198,8 +198,8 @@ def test_root_by_argument_then_environment_then_beside_the_config(tmp_path, monk
 
 
 def test_a_named_root_that_does_not_exist(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="--data-root names .*none"):
+    with pytest.raises(ValueError, match="--data-root is .*none, which is not a folder"):
         find_root(tmp_path / "none")
     monkeypatch.setenv("JAXREG_DATA", str(tmp_path / "none"))
-    with pytest.raises(ValueError, match=r"\$JAXREG_DATA names .*none"):
+    with pytest.raises(ValueError, match=r"\$JAXREG_DATA is .*none"):
         find_root()

@@ -113,7 +113,7 @@ def test_listed_file_is_missing(tmp_path):
         ("label", np.zeros((4, 2), np.uint8), r"'label' must be integer \(4, 1\)"),
         ("label", np.zeros((4, 1)), "'label' must be integer .* got float64"),
         ("label", np.array([[1], [2], [40], [3]], np.uint8), "'label' is 40 in row 2"),
-        ("data", np.zeros((4, 32, 3), np.float32), r"the train files hold shapes of \[32, 64\]"),
+        ("data", np.zeros((4, 32, 3), np.float32), r"the train files have shapes of \[32, 64\]"),
     ],
 )
 def test_malformed_file(key, value, message, tmp_path):
@@ -121,7 +121,7 @@ def test_malformed_file(key, value, message, tmp_path):
     replace(folder / "ply_data_train1.h5", key, value)
     with pytest.raises(ValueError, match=message) as error:
         modelnet.load(tmp_path, "train")
-    assert "download" in str(error.value) or "is it a file of" in str(error.value)
+    assert "download" in str(error.value) or "is it a file from" in str(error.value)
 
 
 def test_labels_without_second_axis(tmp_path):

@@ -363,7 +363,7 @@ def test_scans_of_different_sizes(seed):
     pair = make_pair_from_scans(jax.random.key(seed), *clouds, config)
     assert sorted(rows_of(pair.source.points, source)) == list(range(80))
     assert sorted(rows_of(unmoved(pair), reference)) == list(range(120))
-    with pytest.raises(ValueError, match="kept = 90 points cannot remain of the 80"):
+    with pytest.raises(ValueError, match="kept = 90, but each cloud has 80 points"):
         make_pair_from_scans(jax.random.key(seed), *clouds, PairConfig(kept=90))
 
 
@@ -373,9 +373,9 @@ def test_scans_of_different_sizes(seed):
 @pytest.mark.parametrize(
     ("changes", "points", "message"),
     [
-        ({"kept": 101}, 100, "kept = 101 points cannot remain of the 100"),
+        ({"kept": 101}, 100, "kept = 101, but each cloud has 100 points"),
         ({"kept": 0}, 100, "choose 1 <= kept <= 100"),
-        ({"sampling": "disjoint"}, 100, "of the 50 that each cloud"),
+        ({"sampling": "disjoint"}, 100, "each cloud has 50 points before the crop"),
         ({}, 99, "points = 100 cannot be taken from a shape of 99"),
         ({"points": 0}, 99, "points = 0 cannot be taken"),
         ({"sampling": "disjoint"}, 1, "points = 100 cannot be taken from a shape of 1"),

@@ -139,10 +139,10 @@ def test_pose_of_a_fragment(tmp_path):
     path = write_fragment(tmp_path, 3, np.zeros((1, 3)))
     np.testing.assert_array_equal(seven_scenes.read_pose(path), POSE)
     path.with_name("cloud_bin_3.info.txt").write_text("scene\n1 2 3\n")
-    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must hold one line"):
+    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must contain one line"):
         seven_scenes.read_pose(path)
     path.with_name("cloud_bin_3.info.txt").unlink()
-    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must hold one line"):
+    with pytest.raises(ValueError, match=r"cloud_bin_3\.info\.txt must contain one line"):
         seven_scenes.read_pose(path)
 
 
@@ -157,10 +157,10 @@ def test_truncated_ply(kept, text, tmp_path):
 
 
 def test_malformed_fragments(tmp_path):
-    with pytest.raises(ValueError, match=r"cloud_bin_7\.ply: there is no such file"):
+    with pytest.raises(ValueError, match=r"cloud_bin_7\.ply: no such file"):
         seven_scenes.read_fragment(tmp_path / "cloud_bin_7.ply")
     path = write_fragment(tmp_path, 0, np.zeros((0, 3)))
-    with pytest.raises(ValueError, match=r"cloud_bin_0\.ply holds no point"):
+    with pytest.raises(ValueError, match=r"cloud_bin_0\.ply contains no points"):
         seven_scenes.read_fragment(path)
     path = write_fragment(tmp_path, 0, [(0, 0, 0), (0, np.nan, 0)])
     with pytest.raises(ValueError, match=r"cloud_bin_0\.ply: vertex 1 is not finite"):

@@ -127,7 +127,7 @@ def spoiled(pair, row, rotation=None, translation=None):
     [
         (lambda p: spoiled(p, 3, translation=np.nan), "predicted transform of pair 3 .*not finite"),
         (lambda p: spoiled(p, 4, rotation=np.inf), "predicted transform of pair 4 .*not finite"),
-        (lambda p: spoiled(p, 5, rotation=1.1 * np.eye(3)), "rotation of pair 5 is no rotation"),
+        (lambda p: spoiled(p, 5, rotation=1.1 * np.eye(3)), "rotation of pair 5 is not a rotation"),
         (lambda p: spoiled(p, 6, rotation=np.diag([1, 1, -1])), "pair 6 .*det R = -1"),
         (lambda p: RigidTransform(p.rotation[:9], p.translation[:9]), "9 predicted .* for 10 true"),
         (lambda p: RigidTransform(p.rotation[0], p.translation[0]), "must be stacked"),

@@ -87,8 +87,8 @@ def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
         ({}, "nothing to evaluate: .*Methods: identity, icp, register"),
         ({"method": "magic"}, "no method 'magic': choose one of identity"),
         ({"method": "icp", "refine": "magic"}, "no refinement 'magic': choose one of icp"),
-        ({"transforms": "nowhere.npz"}, "no file nowhere.npz: give an NPZ file with"),
-        ({"transforms": str(ROOT / "LICENSE")}, "LICENSE is no .npz of arrays"),
+        ({"transforms": "nowhere.npz"}, "nowhere.npz: no such file; give an NPZ file with"),
+        ({"transforms": str(ROOT / "LICENSE")}, "LICENSE is not an .npz of arrays"),
         ({"method": "checkpoint:nowhere"}, "no checkpoint in nowhere"),
     ],
 )

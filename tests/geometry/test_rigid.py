@@ -137,7 +137,7 @@ def test_axes_that_do_not_fit_are_named(rng):
         (lambda: apply(many, np.zeros((5, 3))), "leading axes (4,) cannot move points (5, 3)"),
         (lambda: apply(draw(rng), np.zeros((5, 4))), "points must have shape (..., 3), got (5, 4)"),
         (lambda: apply(crooked, np.zeros((5, 3))), "not (3, 3) and (4, 3)"),
-        (lambda: compose(many, draw_many(rng, 3)), "leading axes (4,) and (3,) do not compose"),
+        (lambda: compose(many, draw_many(rng, 3)), "leading axes (4,) and (3,) do not match"),
         (lambda: compose(many, crooked), "not (3, 3) and (4, 3)"),
         (lambda: inverse(crooked), "not (3, 3) and (4, 3)"),
         (lambda: to_matrix(crooked), "not (3, 3) and (4, 3)"),

@@ -175,7 +175,7 @@ def test_ptx_lays_every_station_by_its_matrix_and_says_so(tmp_path):
     [
         (PTX + POSE + "1 2 3 0\n", "announces 3 points and has 1"),
         (PTX + POSE + "1 2 x 0\n" * 3, "line 1: a point of this station"),
-        ("1 2 3\n4 5 6\n", "line 1: no header of a station.*name the file .xyz"),
+        ("1 2 3\n4 5 6\n", "line 1: not the header of a station.*name the file .xyz"),
     ],
 )
 def test_malformed_ptx(tmp_path, content, told):

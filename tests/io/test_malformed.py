@@ -45,16 +45,16 @@ CASES = {
     "word.txt": (b"# head\n1 2 3\n4 5 six\n", "line 3"),
     "one-word.txt": (b"hello\n1 2 3\n", "line 1"),
     "names.csv": (b"id,a,b,c\n7,1,2,3\n", "line 1: .* id, a, b, c, .*call those that hold"),
-    "no-z.csv": (b"x,y,time\n1,2,3\n", "x, y, time, and not x, y, z"),
+    "no-z.csv": (b"x,y,time\n1,2,3\n", "x, y, time, not x, y, z"),
     "names.txt": (b"# id,a,b,c\n7,1,2,3\n8,4,5,6\n", "id, a, b, c.*call those that hold"),
     "slashes.txt": (b"\n//R G B\n1 2 3\n4 5 6\n", "line 2: .* R, G, B"),
-    "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"a\[m\], b\[m\], c\[m\], and not x, y, z"),
+    "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"a\[m\], b\[m\], c\[m\], not x, y, z"),
     "blank-in-name.txt": (
         b"Point ID X Y Z Intensity\n1 2 3 4 5\n6 7 8 9 10\n",
         "line 1: the header has 6 names for 5 columns",
     ),
-    "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", ", 0, 1, 2, and not x, y, z"),
-    "binary.txt": (b"\xff\xfe\x00\x81" * 10, "no text"),
+    "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", ", 0, 1, 2, not x, y, z"),
+    "binary.txt": (b"\xff\xfe\x00\x81" * 10, "not a text file"),
     "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),
     "word.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n4 x 6\n7 8 9\n", "point 1"),
     "short-binary.pcd": (PCD.format(kind="binary").encode() + ROW, "row 1"),
@@ -73,7 +73,7 @@ CASES = {
     "cut.off": (b"OFF\n8 12 0\n0 0 0\n", "malformed or truncated"),
     "bad-face.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n", "export it again"),
     "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 20, "truncated"),
-    "unknown.xyzzy": (b"1 2 3\n", "suffix"),
+    "unknown.xyzzy": (b"1 2 3\n", "unknown format"),
 }
 
 
@@ -156,7 +156,7 @@ def test_pickles_are_never_loaded(tmp_path):
 @pytest.mark.parametrize(("shape", "dtype"), [((5,), float), ((5, 2), float), ((5, 3), "U3")])
 def test_arrays_that_are_no_cloud(tmp_path, shape, dtype):
     np.save(tmp_path / "a.npy", np.zeros(shape, dtype))
-    with pytest.raises(ValueError, match=r"not numbers \(n, 3\)"):
+    with pytest.raises(ValueError, match=r"not numbers of shape \(n, 3\)"):
         io.read_cloud(tmp_path / "a.npy")
 
 

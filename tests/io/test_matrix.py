@@ -31,5 +31,5 @@ def test_matrices_are_read_from_any_form(tmp_path, name):
 
 def test_a_pickled_matrix_is_refused(tmp_path):
     np.save(tmp_path / "T.npy", np.array([{}], object), allow_pickle=True)
-    with pytest.raises(ValueError, match="holds no 4x4 matrix"):
+    with pytest.raises(ValueError, match="does not contain a 4x4 matrix"):
         read_matrix(tmp_path / "T.npy")

@@ -55,7 +55,7 @@ def test_places_that_cannot_be_are_refused(tmp_path):
     for path, taken, message in (
         (tmp_path / "no" / "a.txt", [], r"the folder .*no does not exist"),
         (tmp_path, [], "is a directory"),
-        (tmp_path / "a.txt", [tmp_path / "b.txt"], "is read or written by this command already"),
+        (tmp_path / "a.txt", [tmp_path / "b.txt"], "is already read or written by this command"),
     ):
         with pytest.raises(ValueError, match=message):
             check_place(path, taken)

@@ -153,12 +153,12 @@ def test_losses_summed_over_the_steps(ours, theirs, pair):
 
 
 def test_what_is_no_weight_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"no file .*missing\.npz"):
+    with pytest.raises(ValueError, match=r"missing\.npz: no such file"):
         load_rienet(tmp_path / "missing.npz")
     text, other = tmp_path / "text.npz", tmp_path / "other.npz"
     text.write_text("no archive")
     np.savez(other, weight=np.zeros(3))
-    with pytest.raises(ValueError, match=r"text\.npz is no \.npz"):
+    with pytest.raises(ValueError, match=r"text\.npz is not an \.npz"):
         load_rienet(text)
     with pytest.raises(ValueError, match=r"other\.npz has no array 'emb_nn"):
         load_rienet(other)

@@ -118,7 +118,7 @@ def test_initial_pose_is_used(seed):
 BAD = {
     "has shape": np.zeros((20, 2)),
     "has dtype": np.array([["a", "b", "c"]] * 20),
-    "point 3 is": np.where(np.arange(20)[:, None] >= 3, np.nan, np.zeros((20, 3))),
+    "the first is point 3, ": np.where(np.arange(20)[:, None] >= 3, np.nan, np.zeros((20, 3))),
     "2 finite points": np.zeros((2, 3)),
 }
 

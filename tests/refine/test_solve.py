@@ -315,7 +315,7 @@ def test_keywords_win_over_the_configuration_and_may_be_traced(method, seed):
 
 @each_method
 def test_copies_correspond_in_batches_too(method, seed):
-    """XLA computes the moved points of a batch anew where their distances are compared."""
+    """XLA computes the moved points of a batch again when their distances are compared."""
     x = np.random.default_rng(seed).normal(size=(3, 30, 3))
     turn = Rotation.from_rotvec([0.02, 0.05, 0.03]).as_matrix()
     y = jnp.asarray(x @ turn.T + 0.02)

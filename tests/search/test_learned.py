@@ -123,10 +123,10 @@ def test_released_weights_fit_the_search_they_are_loaded_for():
     network = load_features()
     check_network(network, 48)
     with pytest.raises(
-        ValueError, match=r"trained with radii = \[0.2, 0.4, 0.8\], and this search"
+        ValueError, match=r"trained with radii = \[0.2, 0.4, 0.8\], but this search"
     ):
         load_features(config=SearchConfig(radii=(0.1, 0.4, 0.8)))
-    with pytest.raises(ValueError, match="not those of features of the search"):
+    with pytest.raises(ValueError, match="not those of a feature network"):
         load_features("modelnet40")
     with pytest.raises(ValueError, match="no released weights 'nothing'"):
         load_features("nothing")

@@ -263,7 +263,8 @@ def test_derivatives_are_finite_and_modes_agree_at_degenerate_inputs(name, row, 
 
 @rows(["network.losses.step_losses"])
 def test_derivatives_hold_in_optimised_kernels_too(name, row, seed):
-    """The other tests compile without LLVM's optimisation, which rounds what is computed twice anew."""
+    """The other tests compile without LLVM's optimisation, which may round a repeated computation
+    differently."""
     function, values, leaves = floating(row, row.generic)
     rng = np.random.default_rng(seed)
     direction = [rng.normal(size=np.shape(x)) for x in values]

@@ -70,7 +70,7 @@ def test_the_tree_is_that_of_flax(tmp_path):
 def test_an_unknown_name_lists_the_known_ones(tmp_path):
     with pytest.raises(ValueError, match="no released weights 'nothing': choose from modelnet40"):
         released.load_pretrained("nothing")
-    with pytest.raises(ValueError, match=r"no weights .*nothing.npz with a card"):
+    with pytest.raises(ValueError, match=r"nothing.npz and .*nothing.json not found: give"):
         released.load_pretrained(str(tmp_path / "nothing"))
 
 
@@ -86,7 +86,7 @@ def test_the_features_of_the_search_are_not_a_network():
 @pytest.mark.parametrize(
     ("suffix", "content", "message"),
     [
-        (".npz", b"PK rubbish", r"mine.npz is no .npz of arrays .*copy it again"),
+        (".npz", b"PK rubbish", r"mine.npz is not an .npz of arrays .*copy it again"),
         (".json", b"{", r"mine.json cannot be read .*copy it again"),
         (".json", b"[1]", r"mine.json is not a card of weights.*copy it again"),
         (".json", b'{"config": {"model": {"kk": 1}}}', "mine.json: .*unknown key 'kk'"),
@@ -137,7 +137,7 @@ def test_a_name_that_is_taken_is_refused_until_its_files_are_deleted(tmp_path):
         released.check_new_name("my_scans-2", tmp_path / "weights")
     (tmp_path / "weights" / "my_scans-2.npz").unlink()
     released.check_new_name("my_scans-2", tmp_path / "weights")
-    with pytest.raises(ValueError, match="there are weights 'modelnet40' already"):
+    with pytest.raises(ValueError, match="weights 'modelnet40' already exist"):
         released.check_new_name("modelnet40", tmp_path)
 
 

@@ -25,7 +25,7 @@ _TO_Y = Rotation.from_euler("x", -90, degrees=True).as_matrix()
 
 
 def stairs(rng: Generator) -> Triangles:
-    """A flight of steps, a landing, a wall on one side at times."""
+    """A flight of steps, a landing, and sometimes a wall on one side."""
     count, width = rng.integers(3, 8), rng.uniform(0.6, 2.0)
     run, rise = rng.uniform(0.2, 0.5, 2)
     parts = [box((run, width, rise * i), (run * i, 0, rise * i / 2)) for i in range(1, count + 1)]
@@ -37,7 +37,7 @@ def stairs(rng: Generator) -> Triangles:
 
 
 def _legs(rng: Generator, width: float, depth: float, height: float) -> Triangles:
-    """Four legs below z = 0, straight and square or round and splayed."""
+    """Four legs below z = 0, either straight and square or round and splayed."""
     thick = rng.uniform(0.05, 0.12)
     x, y = width / 2 - thick, depth / 2 - thick
     if rng.random() < 0.5:
@@ -61,7 +61,7 @@ def table(rng: Generator) -> Triangles:
 
 
 def chair(rng: Generator) -> Triangles:
-    """Seat, back, legs, and one or two arms at times."""
+    """Seat, back, legs, and sometimes one or two arms."""
     width, depth, height = rng.uniform(0.8, 1.2), rng.uniform(0.8, 1.1), rng.uniform(0.6, 1.0)
     back, lean = rng.uniform(0.7, 1.3), rng.uniform(0.0, 0.3)
     panel = place(
@@ -205,7 +205,7 @@ def guitar(rng: Generator) -> Triangles:
 
 
 def monitor(rng: Generator) -> Triangles:
-    """A screen on a stand, tilted, with a box below at times."""
+    """A screen on a stand, tilted, sometimes with a box below."""
     width, height = rng.uniform(1.2, 2.0), rng.uniform(0.8, 1.2)
     tilt = Rotation.from_euler("y", rng.uniform(-0.3, 0.1)).as_matrix()
     screen = union(box((0.1, width, height)), box((0.2, 0.5 * width, 0.5 * height), (-0.12, 0, 0)))

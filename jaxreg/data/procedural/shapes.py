@@ -1,4 +1,4 @@
-"""Procedural shapes: seeded, unlimited, and made on the spot, so that nothing need be downloaded.
+"""Procedural shapes: seeded, unlimited, and made on the spot, with nothing to download.
 
 Shape `index` of a seed belongs to family ``index % len(families())``. Beyond its family's own
 random details it is warped and gets a few random attachments, so that its pose is well defined.
@@ -23,10 +23,10 @@ def families() -> tuple[str, ...]:
 
 
 def sample_shape(seed: int, index: int, *, points: int) -> np.ndarray:
-    """Points (points, 3) float32 of shape `index`, independent of each other and uniform by area.
+    """A procedural shape in the unit sphere: (points, 3) float32, independent and uniform by area.
 
-    Zero mean and largest norm 1, as ModelNet40. Two independent samples of one surface are the two
-    halves of a cloud of twice the points, which is what ``sampling = "disjoint"`` makes of it.
+    Zero mean and largest norm 1, as in ModelNet40. The two halves of a cloud are independent
+    samples of one surface, and ``sampling = "disjoint"`` uses them as such.
 
     Raises:
       ValueError: `seed` or `index` is negative, or fewer than 2 points are asked for.

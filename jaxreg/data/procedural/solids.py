@@ -43,7 +43,7 @@ def drum(rng: Generator) -> Triangles:
 
 
 def cone(rng: Generator) -> Triangles:
-    """A cone on a slab that it does not stand in the middle of."""
+    """A cone on a slab, off-centre."""
     radius, height = rng.uniform(0.4, 0.9), rng.uniform(0.8, 2.0)
     slab = box((*(2 * radius * rng.uniform(1.0, 1.5, 2)), 0.15), (0, 0, -height / 2))
     tip = cylinder(radius, height, top=radius * rng.uniform(0.0, 0.4))
@@ -51,7 +51,7 @@ def cone(rng: Generator) -> Triangles:
 
 
 def torus(rng: Generator) -> Triangles:
-    """A ring whose tube swells and thins along the way, part of it missing at times."""
+    """A ring whose tube swells and thins along the way, sometimes with a part missing."""
     turn = rng.choice([2 * np.pi, rng.uniform(3.5, 5.5)])
     angle = np.linspace(0, turn, 40)
     swell = 1 + rng.uniform(0.2, 0.5) * np.sin(angle + rng.uniform(0, 6))
@@ -135,7 +135,7 @@ def blob(rng: Generator) -> Triangles:
 
 
 def composite(rng: Generator) -> Triangles:
-    """Four to eight primitives, anywhere and anyhow."""
+    """Four to eight primitives in random poses."""
     parts = []
     for _ in range(rng.integers(4, 9)):
         size = rng.uniform(0.2, 0.9, 3)

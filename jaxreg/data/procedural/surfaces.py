@@ -1,7 +1,7 @@
 """Triangle surfaces for the procedural shapes: primitives, deformation, uniform samples.
 
-A surface is the array (t, 3, 3) of its triangles' corners, so that a union is a concatenation. z is
-up. Nothing here needs a watertight mesh: only the area of the triangles counts.
+A surface is the array (t, 3, 3) of its triangles' corners, so a union is a concatenation. z is up.
+Nothing here needs a watertight mesh: only the area of the triangles counts.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ def from_grid(vertices: np.ndarray) -> Triangles:
 
 
 def union(*surfaces: Triangles) -> Triangles:
-    """All of them as one surface; parts inside of others are kept, as in most CAD models."""
+    """All of them as one surface; parts inside others are kept, as in most CAD models."""
     return np.concatenate(surfaces)
 
 
@@ -83,7 +83,7 @@ def tube(curve: np.ndarray, radius, *, sections: int = 10) -> Triangles:
     normal = np.empty_like(curve)
     normal[0] = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
     normal[0] /= np.linalg.norm(normal[0])
-    for i in range(1, len(curve)):  # Carried along, so that the tube does not twist.
+    for i in range(1, len(curve)):  # Carried along to keep the tube from twisting.
         normal[i] = normal[i - 1] - (normal[i - 1] @ tangent[i]) * tangent[i]
         normal[i] /= np.linalg.norm(normal[i])
     binormal = np.cross(tangent, normal)

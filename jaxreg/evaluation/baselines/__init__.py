@@ -1,4 +1,4 @@
-"""Registration without learning, by the libraries that people use, on the same pairs."""
+"""Registration without learning, by widely used libraries, on the same pairs."""
 
 import functools
 import importlib
@@ -25,13 +25,13 @@ _FUNCTIONS = {name: ("open3d", *rest) for name, rest in _OPEN3D.items()} | {
     "small_gicp": ("small_gicp", "gicp", {}),
     "kiss_matcher_icp": ("kiss_matcher", "icp", {}),
 }
-"""The module, the function and the options of every name."""
+"""Module, function and options for every name."""
 NAMES = tuple(_FUNCTIONS)
-"""What `choose` takes, alone or with a spacing."""
+"""The names that `choose` takes, alone or with a spacing."""
 
 
 def choose(name: str) -> Callable[[np.ndarray, np.ndarray], RigidTransform]:
-    """The baseline of a name, such as "open3d_fgr": a function of two clouds (n, 3), (m, 3).
+    """The baseline by its name, such as "open3d_fgr": a function of two clouds (n, 3), (m, 3).
 
     "open3d_fgr@0.02" sets the `spacing` that its lengths derive from, in the unit of the clouds.
 
@@ -45,7 +45,7 @@ def choose(name: str) -> Callable[[np.ndarray, np.ndarray], RigidTransform]:
     module_name, function_name, options = _FUNCTIONS[name]
     if at:
         options = options | {"spacing": _positive(spacing)}
-    # Imported here: config and metrics must not wait seconds for Open3D, nor need it.
+    # Imported here: config and metrics must not need Open3D, nor wait seconds for it.
     module = importlib.import_module(f"{__name__}.{module_name}")
     module.require()
     return functools.partial(getattr(module, function_name), **options)

@@ -17,8 +17,8 @@ def icp(
 ) -> RigidTransform:
     """KISS-Matcher with voxels of `spacing`, else its defaults, then Open3D's point-to-plane ICP.
 
-    The matcher ends in a pose from features and has no refinement of its own; this one is that of
-    `open3d_ransac_icp`. It runs on several threads, and the same call may give another pose.
+    The matcher returns a pose from features, unrefined; the refinement here is that of
+    `open3d_ransac_icp`. It runs on several threads, so the same call may give another pose.
 
     Raises:
       ValueError: a cloud is not finite, not (n, 3) or has fewer than three points; or KISS-Matcher or

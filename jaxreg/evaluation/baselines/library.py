@@ -1,11 +1,11 @@
-"""The libraries that the baselines call: each is there, or the message says how to get it."""
+"""The libraries that the baselines call; if one is missing, the message says how to install it."""
 
 import importlib
 from typing import Any
 
 
 def library(module: str, name: str) -> Any:
-    """The module, by its name: a checker of types takes `import open3d` here for our own file.
+    """The module, imported by name: a type checker would take `import open3d` here for our own file.
 
     Raises:
       ValueError: it is not installed.

@@ -5,19 +5,21 @@ All lengths derive from one, `spacing`, by the ratios of Open3D's tutorial on gl
 normals within 2 of it, FPFH within 5, RANSAC inliers within 1.5, FGR inliers within 0.5. The default
 suits 1024 points on a unit sphere.
 
-`open3d_icp`, `open3d_icp_point_to_plane`, `open3d_fgr` and `open3d_fpfh_ransac` are rows that papers
-print, of the clouds as they are; ICP pairs points within 10 of `spacing`. `open3d_icp_coarse_to_fine`,
-`open3d_fgr_gicp` and `open3d_ransac_gicp` add a refinement within 2 and then 0.6 of it that runs until
-it has converged. `open3d_ransac_icp`, `open3d_fgr_icp` and `open3d_fgr_icp_default` are the tutorial:
-features of voxels of `spacing`, then point-to-plane ICP on the whole clouds with Open3D's own criteria.
+`open3d_icp`, `open3d_icp_point_to_plane`, `open3d_fgr` and `open3d_fpfh_ransac` are rows that
+papers print, for the clouds as they are; ICP pairs points within 10 of `spacing`.
+`open3d_icp_coarse_to_fine`, `open3d_fgr_gicp` and `open3d_ransac_gicp` add a refinement within 2
+and then 0.6 of it, until it has converged. `open3d_ransac_icp`, `open3d_fgr_icp` and
+`open3d_fgr_icp_default` are the tutorial: features of voxels of `spacing`, then point-to-plane ICP
+on the whole clouds with Open3D's own criteria.
 
-What differs from the tutorial is to Open3D's advantage, as measured. Normals point away from the
-centre of the cloud: see `_oriented`. Clouds that are no denser than the voxels (`_are_dense`) stay as
-they are, instead of losing every fifth point, and their ICP pairs points within 2 and then 1 of
-`spacing` in place of 0.4, within which most of their points have no neighbour. FGR has `decrease_mu`,
-as in its authors' own program (https://github.com/isl-org/FastGlobalRegistration); Open3D's default for
-Python is without, where the distance has no effect and every outlier keeps its pull. That, as in the
-tutorial, is `open3d_fgr_icp_default`.
+Measurements show that the differences from the tutorial are to Open3D's advantage. Normals point
+away from the centre of the cloud: see `_oriented`. Clouds that are no denser than the voxels
+(`_are_dense`) stay as they are, instead of losing every fifth point, and their ICP pairs points
+within 2 and then 1 of `spacing` instead of 0.4, within which most of their points have no
+neighbour. FGR has `decrease_mu`, as in its authors' own program
+(https://github.com/isl-org/FastGlobalRegistration); Open3D's default for Python leaves it off; then
+the distance has no effect and every outlier keeps its pull. `open3d_fgr_icp_default` does that, as
+in the tutorial.
 
 Every function takes a source (n, 3) and a reference (m, 3) and raises ValueError when a cloud is
 not finite, not (n, 3), or has fewer than three points, and when Open3D is not installed. Random
@@ -34,7 +36,7 @@ from jaxreg.geometry.clouds import check_points
 from jaxreg.types import RigidTransform
 
 SPACING = 0.05
-"""About the distance between neighbours of 1024 points on a unit sphere."""
+"""Roughly the distance between neighbours of 1024 points on a unit sphere."""
 _NORMAL_NEIGHBORS, _FPFH_NEIGHBORS = 30, 100
 _ICP_ITERATIONS, _ICP_TOLERANCE = 100, 1e-9
 """Open3D stops after 30 iterations, or at 1e-6, which leaves most exact copies unfinished."""
@@ -50,7 +52,7 @@ def icp(
     to_plane: bool = False,
     fine: bool = False,
 ) -> RigidTransform:
-    """ICP from the identity, point to point or to plane; `fine`: then with the overlap's pairs only."""
+    """ICP from the identity, to points or planes; with `fine`, then with the overlap's pairs only."""
     clouds = _clouds(source, reference, spacing)
     estimation = _registration().TransformationEstimationPointToPlane() if to_plane else None
     pose = _icp(*clouds, np.eye(4), 10 * spacing, estimation)
@@ -66,7 +68,7 @@ def from_features(
     spacing=SPACING,
     seed: int = 0,
 ) -> RigidTransform:
-    """Matches of FPFH (Rusu, Blodow and Beetz, 2009), a pose of them, and a refinement of the pose.
+    """Match FPFH (Rusu, Blodow and Beetz, 2009), find a pose from the matches, and refine it.
 
     `coarse` is fast global registration (Zhou, Park and Koltun, 2016) or RANSAC over triplets of
     matches; `refinement` "icp" is the tutorial, with features of voxels.
@@ -127,8 +129,8 @@ def _oriented(cloud: Any, spacing: float) -> Any:
     cloud.estimate_normals(
         open3d.geometry.KDTreeSearchParamHybrid(radius=2 * spacing, max_nn=_NORMAL_NEIGHBORS)
     )
-    # FPFH depends on the side that a normal points to, and Open3D leaves that to the axes: turned by
-    # any rotation, half of the normals change sides. Away from the centre is a side that turns along.
+    # FPFH depends on the side that a normal points to, and Open3D leaves that to the axes: under a
+    # rotation, half of the normals change sides. The side away from the centre turns with the cloud.
     cloud.orient_normals_towards_camera_location(cloud.get_center())
     cloud.normals = open3d.utility.Vector3dVector(-np.asarray(cloud.normals))
     return cloud
@@ -177,7 +179,7 @@ def _ransac(
 
 
 def _are_dense(source: Any, reference: Any, spacing: float) -> bool:
-    """Whether both clouds have more than two points a voxel, as scans do in the tutorial."""
+    """Whether both clouds have more than two points per voxel, as scans do in the tutorial."""
     return all(
         2 * len(cloud.voxel_down_sample(spacing).points) < len(cloud.points)
         for cloud in (source, reference)

@@ -17,9 +17,10 @@ _ITERATIONS, _TOLERANCE = 100, 1e-6
 def gicp(
     source: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "m 3"], *, spacing=SPACING
 ) -> RigidTransform:
-    """Generalised ICP from the identity, pairs within 10 `spacing`, then within 0.6 of it.
+    """Generalised ICP from the identity, with pairs within 10 times, then 0.6 times `spacing`.
 
-    Clouds are thinned to 0.2 `spacing`. Single-threaded, so the same call gives the same transform.
+    Clouds are thinned to 0.2 times `spacing`. Single-threaded, so the same call gives the same
+    transform.
 
     Raises:
       ValueError: a cloud is not finite, not (n, 3) or has fewer than three points; or small_gicp is
