@@ -48,7 +48,8 @@ def as_utf8(content: bytes) -> bytes:
 
 def with_points(content: bytes) -> bytes:
     """The body of an ascii file with "1,5" as 1.5 and "-nan(ind)" as nan."""
-    content = _ODD.sub(b"nan", content) if b"#" in content or b"(" in content else content
+    if any(mark in content for mark in (b".#", b",#", b"(")):
+        content = _ODD.sub(b"nan", content)
     return _DECIMAL.sub(b".", content) if b"," in content else content
 
 
