@@ -38,7 +38,7 @@ wheel: $(BIN)/python  ## build the wheel, install it without extras elsewhere, a
 fuzz: $(VENV)/.installed-dev  ## 10,000 examples of whatever may be given to register()
 	$(BIN)/python -m pytest -n 2 tests/scans/test_fuzz.py --hypothesis-profile=fuzz
 
-cases: $(BIN)/python  ## run the case scripts in the folders $(CASES), where there are any
+cases: $(VENV)/.installed-dev  ## run the case scripts in the folders $(CASES), where there are any
 	@$(BIN)/python tests/cases.py $(CASES)
 
 mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
