@@ -3,9 +3,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py) benchmarks research examples
+CASES ?= ../shared/cases ../shared/cases_jax
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help demo test coverage slow lint types wheel docs fuzz mutants tables figures baselines clean
+.PHONY: help demo test coverage slow lint types wheel docs fuzz cases mutants tables figures baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -36,6 +37,9 @@ wheel: $(BIN)/python  ## build the wheel, install it without extras elsewhere, a
 
 fuzz: $(VENV)/.installed-dev  ## 10,000 examples of whatever may be given to register()
 	$(BIN)/python -m pytest -n 2 tests/scans/test_fuzz.py --hypothesis-profile=fuzz
+
+cases: $(VENV)/.installed-dev  ## run the case scripts in the folders $(CASES), where there are any
+	@$(BIN)/python tests/cases.py $(CASES)
 
 mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must notice
 	$(BIN)/python tests/mutants.py

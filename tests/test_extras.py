@@ -17,6 +17,7 @@ USES = {
         "train",
     ),
     "laspy": ("import jaxreg.io; jaxreg.io.read_cloud('a.las')", "las"),
+    "pye57": ("import jaxreg.io; jaxreg.io.read_cloud('a.e57')", "e57"),
 }
 # What `pip install jaxreg` promises works without any of them.
 CORE = """
@@ -44,6 +45,7 @@ def run_without(names, code, folder):
 def test_a_missing_library_is_named_with_its_extra(name, tmp_path):
     code, brings = USES[name]
     (tmp_path / "a.las").write_bytes(b"LASF")
+    (tmp_path / "a.e57").write_bytes(b"ASTM-E57")
     done = run_without([name], code, tmp_path)
     message = done.stderr.splitlines()[-1]
     assert message.startswith("ImportError: ")

@@ -18,6 +18,7 @@ from jaxreg.cli.options import NOT_TRUSTED, SUCCESS, complain, line, say
 from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
+    from jaxreg.io import Scan
     from jaxreg.scans.pair import ScanRegistration
 
 _CACHE_MISS = "/jax/compilation_cache/cache_misses"
@@ -47,11 +48,13 @@ class Register:
     """
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-    """The cloud to move: PLY, PCD, XYZ/TXT/CSV, NPY/NPZ, OBJ/OFF/STL (sampled), LAS/LAZ."""
+    """Cloud that moves: PLY, PCD, text of points, PTX, E57, LAS/LAZ, NPY/NPZ, or a mesh (PLY, STL, OBJ,
+    OFF, GLB), which is sampled; also packed (.gz)."""
     reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
     """The cloud to align it with."""
     output: Output = None
-    """Write the aligned source to this file (PLY and LAS keep colours and all other properties)."""
+    """Write the aligned source here (PLY, PCD, text and LAS keep colours and whatever else they hold; a
+    mesh stays a mesh)."""
     json: OptionalPath = None
     """Write transform, numbers and verdict to this file (JSON)."""
     plot: OptionalPath = None
@@ -76,19 +79,23 @@ class Register:
 
         _check_outputs(self)
         initial = io.read_matrix(self.initial) if self.initial else None
-        source, reference = (
-            _checked(path, self.nonfinite) for path in (self.source, self.reference)
-        )
+        scans = [_checked(path, self.nonfinite) for path in (self.source, self.reference)]
+        source, reference = (scan.points for scan in scans)
         begin = time.perf_counter()
         with _patience():
             result = _registered(self, source, reference, initial)
         seconds = time.perf_counter() - begin
+        lost: list[str] = []
         try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
-            _write_results(self, source, reference, result)
+            _write_results(self, source, reference, result, lost)
         finally:
-            _print_result(self, (len(source), len(reference)), result, seconds)
+            _print_result(self, scans, result, seconds)
         for path in _outputs(self):
             line("wrote", str(path))
+        for note in lost:
+            line("note", note)
+        for hint in _hints(source, reference, success=result.success):
+            line("hint", hint)
         if not result.success:
             line("hint", _HINT if self.initial else _HINT + _START)
         return SUCCESS if result.success else NOT_TRUSTED
@@ -113,12 +120,13 @@ def _registered(
 
 
 def _print_result(
-    command: Register, sizes: tuple[int, int], result: "ScanRegistration", seconds: float
+    command: Register, scans: list["Scan"], result: "ScanRegistration", seconds: float
 ) -> None:
     from jaxreg.scans import summary
 
-    for name, size in zip(("source", "reference"), sizes, strict=True):
-        line(name, f"{getattr(command, name)} ({size:,} points)")
+    for name, scan in zip(("source", "reference"), scans, strict=True):
+        told = "; ".join([f"{len(scan.points):,} points", *scan.notes])
+        line(name, f"{getattr(command, name)} ({told})")
     for name, value in (summary.figures(result) | {"time": f"{seconds:.2f} s"}).items():
         line(name, value.replace("\n", "; "))
     say("transformation (source to reference)")
@@ -126,6 +134,20 @@ def _print_result(
     line("verdict", summary.verdict_line(result))
     if result.reason:
         line("reason", result.reason)
+
+
+def _hints(source: np.ndarray, reference: np.ndarray, *, success: bool) -> list[str]:
+    """What is odd about the clouds; of a success only that their sizes differ."""
+    from jaxreg.scans import diagnosis
+
+    clouds = {"source": source, "reference": reference}
+    clouds = {name: p[np.isfinite(p).all(axis=1)] for name, p in clouds.items()}
+    least = 1.2 if success else 1.1
+    hints = diagnosis.compared(clouds["source"], clouds["reference"], least=least)
+    if not success:
+        for name, points in clouds.items():
+            hints += [f"the {name}: {told}" for told in diagnosis.findings(points)]
+    return hints
 
 
 def _outputs(command: Register) -> list[Path]:
@@ -137,7 +159,7 @@ def _check_outputs(command: Register) -> None:
     from jaxreg import io
 
     if command.output:
-        io.check_writable(command.output)
+        io.check_output(command.output, command.source)
     if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
     if command.plot:
@@ -148,12 +170,13 @@ def _check_outputs(command: Register) -> None:
         taken.append(path)
 
 
-def _checked(path: Path, nonfinite: str) -> np.ndarray:
-    """The points of a file, as `register` accepts them."""
+def _checked(path: Path, nonfinite: str) -> "Scan":
+    """What is in a file, with points that `register` will accept."""
     from jaxreg import io
     from jaxreg.geometry import clouds
 
-    points = io.read_cloud(path)
+    scan = io.read_scan(path)
+    points = scan.points
     finite = np.isfinite(points).all(axis=1)
     if nonfinite == "raise" and not finite.all():
         row = int(np.argmin(finite))
@@ -162,12 +185,17 @@ def _checked(path: Path, nonfinite: str) -> np.ndarray:
             f"point {row}: remove them, or give --nonfinite drop."
         )
     clouds.check_points(points, str(path), nonfinite="drop")
-    return points
+    return scan
 
 
 def _write_results(
-    command: Register, source: np.ndarray, reference: np.ndarray, result: "ScanRegistration"
+    command: Register,
+    source: np.ndarray,
+    reference: np.ndarray,
+    result: "ScanRegistration",
+    lost: list[str],
 ) -> None:
+    """Write what is asked for; `lost` gets what a format cannot hold."""
     from jaxreg import io
     from jaxreg.view import page
 
@@ -178,8 +206,12 @@ def _write_results(
     def draw(path: Path) -> None:
         page.draw_registration(path, source, reference, result)
 
+    def write_moved(path: Path) -> None:
+        moved = (result.rotation, result.translation)
+        lost.extend(io.write_moved(path, command.source, *moved, points=source))
+
     writers: tuple[tuple[Path | None, Callable[[Path], None]], ...] = (
-        (command.output, lambda path: _write_moved(path, command.source, source, result)),
+        (command.output, write_moved),
         (command.json, lambda path: _write_json(path, command, result)),
         (command.plot, draw),
         (command.html, write_page),
@@ -188,21 +220,6 @@ def _write_results(
         if path is not None:
             with io.whole(path) as part:
                 write(part)
-
-
-def _write_moved(
-    path: Path, original: Path, source: np.ndarray, result: "ScanRegistration"
-) -> None:
-    """Write the aligned source; from PLY to PLY, or LAS to LAS, with all its properties."""
-    from jaxreg import io
-
-    kinds = {original.suffix.lower(), path.suffix.lower()}
-    if kinds == {".ply"}:
-        io.ply.write_moved(path, original, result.rotation, result.translation)
-    elif kinds <= {".las", ".laz"}:
-        io.las.write_moved(path, original, result.rotation, result.translation)
-    else:
-        io.write_cloud(path, source @ result.rotation.T + result.translation)
 
 
 def _write_json(path: Path, command: Register, result: "ScanRegistration") -> None:

@@ -1,10 +1,13 @@
 """The one check of what users give (a cloud, its normals, a pose), and padding to a few sizes."""
 
+import contextlib
+import os
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxreg.geometry import foreign
 from jaxreg.geometry.rigid import nearest_rotation
 from jaxreg.types import RigidTransform
 
@@ -21,24 +24,27 @@ def check_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
     """`points` as float64 (n, 3), and which rows are finite.
 
+    Also the points of an object that has some (Open3D, PyVista, trimesh), and the columns x, y, z of a
+    structured array or a table. Masked rows count as not finite, and are never refused.
+
     Raises:
       ValueError: not a numeric array of shape (n, 3), fewer than three (finite) points, a
         coordinate beyond 1e100, or, unless `nonfinite` is "drop", one that is NaN or infinite.
     """
     if nonfinite not in ("raise", "drop"):
         raise ValueError(f"nonfinite must be 'raise' or 'drop', got {nonfinite!r}.")
-    array = _as_floats(points, name)
+    given = foreign.points_of(points, name)
+    array = _as_floats(given, name)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(
-            f"{name} has shape {array.shape}, not (n, 3): give one point per row, for "
-            "example points[:, :3]."
-        )
-    x, y, z = np.isfinite(array).T  # three columns at a time are faster than rows of three
+        raise ValueError(f"{name} has shape {array.shape}, {_reshaped(given, array.shape)}.")
+    array, masked = foreign.unmasked(given, array)
+    x, y, z = np.isfinite(array).T  # three columns at a time are quicker than rows of three
     finite = x & y & z
-    if nonfinite == "raise" and not finite.all():
-        row = int(np.argmin(finite))
+    broken = ~finite & ~masked
+    if nonfinite == "raise" and broken.any():
+        row = int(np.argmax(broken))
         raise ValueError(
-            f"{name}: {np.sum(~finite)} of {len(array)} points are not finite, the first is "
+            f"{name}: {np.sum(broken)} of {len(array)} points are not finite, the first is "
             f"point {row}, {array[row].tolist()}: remove them, or pass nonfinite='drop'."
         )
     if finite.sum() < _FEWEST:
@@ -53,13 +59,44 @@ def check_points(
     return array, finite
 
 
+def _reshaped(points: object, shape: tuple[int, ...]) -> str:
+    """What is not (n, 3), and what makes it so."""
+    table = ".to_numpy()" if hasattr(points, "to_numpy") else ""
+    if len(shape) == 2 and shape[0] in (3, 4) and shape[1] > shape[0]:
+        part = f"points{table}.T" + ("" if shape[0] == 3 else "[:, :3]")
+        return f"one point per column, not (n, 3): transpose it, as in {part}"
+    if len(shape) == 2 and shape[1] == 2:
+        return (
+            "not (n, 3): add a column, as in numpy.column_stack([points, numpy.zeros(len(points))])"
+        )
+    if len(shape) == 2 and shape[1] > 3:
+        return f"not (n, 3): give one point per row, x y z, as in points{table}[:, :3]"
+    if len(shape) > 2 and shape[-1] == 3:
+        return "not (n, 3): give one point per row, as in points.reshape(-1, 3)"
+    if len(shape) > 2 and shape[-1] > 3:
+        return "not (n, 3): give one point per row, as in points[..., :3].reshape(-1, 3)"
+    return "not (n, 3): give one point per row, x y z"
+
+
 def _as_floats(points: object, name: str) -> np.ndarray:
+    if isinstance(points, str | os.PathLike):
+        raise ValueError(
+            f"{name} is {str(points)!r}: give its points, as jaxreg.read_cloud({str(points)!r}) reads."
+        )
     try:
         array = np.asarray(points)
-    except (ValueError, TypeError) as error:
+    except Exception as error:  # noqa: BLE001 - tensors raise what their libraries choose
         raise ValueError(
             f"{name} is not an array ({error}): give an array of shape (n, 3)."
         ) from None
+    if array.dtype.kind == "O" and array.ndim == 2:
+        with contextlib.suppress(ValueError, TypeError):
+            array = array.astype(np.float64)
+    if array.dtype.kind == "O" and array.ndim == 0:
+        raise ValueError(
+            f"{name} is a {type(points).__name__}, without an attribute .points to read: give an array "
+            "of shape (n, 3)."
+        )
     if array.dtype.kind not in "fiu":
         raise ValueError(
             f"{name} has dtype {array.dtype}: give real numbers, for example "

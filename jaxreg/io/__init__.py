@@ -6,101 +6,82 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.io import arrays, las, mesh, pcd, ply, text
+from jaxreg.io import arrays, e57, las, mesh, packed, pcd, ptx, text, unread
+from jaxreg.io.contents import Scan
 from jaxreg.io.matrix import read_matrix
 from jaxreg.io.places import check_folder, check_place, whole
+from jaxreg.io.writing import WRITERS, check_output, check_writable, write_cloud, write_moved
 
 __all__ = [
     "READABLE",
     "WRITABLE",
+    "Scan",
     "check_folder",
+    "check_output",
     "check_place",
     "check_writable",
     "read_cloud",
     "read_matrix",
+    "read_scan",
+    "suffix",
     "whole",
     "write_cloud",
+    "write_moved",
 ]
 
-_READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".ply": ply.read,
+_READERS: dict[str, Callable[[Path], Scan]] = {
+    ".ply": mesh.read_ply,
     ".pcd": pcd.read,
-    ".xyz": text.read,
-    ".txt": text.read,
-    ".csv": text.read,
+    **dict.fromkeys(text.SUFFIXES, text.read),
+    ".ptx": ptx.read,
     ".npy": arrays.read,
     ".npz": arrays.read,
-    ".obj": mesh.read,
-    ".off": mesh.read,
-    ".stl": mesh.read,
+    **dict.fromkeys((".obj", ".off", ".stl", ".glb"), mesh.read),
     ".las": las.read,
     ".laz": las.read,
+    ".e57": e57.read,
 }
-_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
-    ".ply": ply.write,
-    ".pcd": pcd.write,
-    ".xyz": text.write,
-    ".txt": text.write,
-    ".csv": text.write,
-    ".npy": arrays.write,
-    ".npz": arrays.write,
-    ".las": las.write,
-    ".laz": las.write,
-}
-READABLE, WRITABLE = tuple(_READERS), tuple(_WRITERS)
+READABLE, WRITABLE = tuple(_READERS), tuple(WRITERS)
+
+
+def suffix(path: str | Path) -> str:
+    """The suffix that tells the format: ".ply" of "a.PLY" and of "a.ply.gz"."""
+    return packed.suffix(Path(path))
 
 
 def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
     """Read a point cloud: (n, 3) float64, in the file's unit and order. The suffix chooses the format.
 
-    Meshes are sampled by area. Points that are NaN stay in place: the caller refuses or drops them.
-    Nothing is ever unpickled.
+    Each format may be packed by gzip (``.ply.gz``). Points that are NaN stay in place: they are for
+    the caller to refuse or to drop. Nothing is ever unpickled.
 
     Raises:
       ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
-        truncated, its header names columns without x, y, z, or it contains no point; the message
-        names the file, the row if there is one, and the remedy.
-      ImportError: a LAS or LAZ file, and laspy is not installed.
+        truncated, its header names columns without x, y, z, or it contains no points; the message
+        names the file, the row where there is one, and the remedy.
+      ImportError: a LAS, LAZ or E57 file, and what reads it is not installed.
+    """
+    return read_scan(path).points
+
+
+def read_scan(path: str | Path) -> Scan:
+    """The points as `read_cloud` gives them, and `notes`: that it is a mesh, or of many stations.
+
+    Raises:
+      ValueError, ImportError: as `read_cloud`.
     """
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"{path} is a directory, not a file: name a file in it.")
-    if path.suffix.lower() not in _READERS:
-        raise ValueError(
-            f"{path}: unknown format '{path.suffix}': convert the file to one "
-            f"of {', '.join(READABLE)}."
-        )
+    if suffix(path) not in _READERS:
+        raise ValueError(unread.advice(path, READABLE))
     if not path.is_file():
         raise ValueError(f"{path}: no such file; check the path.")
     if path.stat().st_size == 0:
         raise ValueError(f"{path} is empty (0 bytes): export it again.")
-    points = _READERS[path.suffix.lower()](path)
-    if len(points) == 0:
-        raise ValueError(f"{path} contains no points: export it again, or choose another file.")
-    return points
-
-
-def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
-    """Write points in the format of the suffix: float64, in text 12 digits, in LAS integer steps.
-
-    LAS and LAZ leave out rows that are not finite; all other formats keep them.
-
-    Raises:
-      ValueError: the suffix is not writable, the folder does not exist, or LAS gets no finite row.
-      ImportError: a LAS or LAZ file, and laspy is not installed.
-    """
-    path = Path(path)
-    check_writable(path)
-    _WRITERS[path.suffix.lower()](path, np.asarray(points, np.float64))
-
-
-def check_writable(path: Path) -> None:
-    """Raise what `write_cloud` would raise before it writes: for suffix, folder, and laspy for LAS."""
-    if path.suffix.lower() not in _WRITERS:
-        raise ValueError(
-            f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
-            f"{', '.join(WRITABLE)}."
-        )
-    if path.suffix.lower() in (".las", ".laz"):
-        las.check_installed(path)
-    check_folder(path)
+    # A damaged file holds numbers that overflow, and NaN that signal.
+    with packed.unpacked(path) as file, np.errstate(all="ignore"):
+        scan = _READERS[suffix(path)](file)
+        if len(scan.points) == 0:
+            raise ValueError(f"{path} contains no points: export it again, or choose another file.")
+    return scan

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxreg.io.contents import Scan
 
-def read(path: Path) -> np.ndarray:
+
+def read(path: Path) -> Scan:
     """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
 
     More columns than three (colours, intensity) are not read. In an NPZ file the array is `points`,
@@ -16,8 +18,11 @@ def read(path: Path) -> np.ndarray:
         content = _loaded(path)
     except Exception as error:  # noqa: BLE001 - numpy, zipfile and zlib raise types of their own
         hint = "save numbers, not objects" if "pickle" in str(error) else "save it again"
-        raise ValueError(f"{path} cannot be read as {path.suffix} ({error}): {hint}.") from None
-    return _chosen(content, path) if isinstance(content, dict) else _points(content, str(path))
+        told = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} cannot be read as {path.suffix} ({told}): {hint}.") from None
+    if isinstance(content, dict):
+        return Scan(_chosen(content, path))
+    return Scan(_points(content, str(path)))
 
 
 def read_arrays(
@@ -69,6 +74,12 @@ def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:
 def _points(array: np.ndarray, where: str) -> np.ndarray:
     if array.dtype.names and set("xyz") <= set(array.dtype.names):
         array = np.stack([array[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[0] == 3 < array.shape[1]:
+        raise ValueError(
+            f"{where} is {array.dtype} {array.shape}, one point per column: save its transpose (n, 3)."
+        )
+    if array.dtype.kind in "fiu" and array.ndim == 3 and array.shape[2] == 3:
+        return array.reshape(-1, 3).astype(np.float64)  # an organised cloud, (height, width, 3)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(
             f"{where} is {array.dtype} {array.shape}, not numbers of shape (n, 3): "

@@ -1,53 +1,41 @@
-"""Text with one point per line: XYZ, TXT, CSV; separated by spaces, tabs, commas or semicolons."""
+"""Text with one point per line: XYZ, TXT, CSV, ASC, PTS, XYZN, XYZRGB; in any encoding."""
 
-import io
+import array
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-_COMMENTS = ("#", "//")
-_MARK = re.compile(r"^\s*[#/]+")
-_LABEL = re.compile(r"^\s*\w+:\s")
-"""As in "# columns: x y z"."""
-_UNIT = re.compile(r"\s+(?=[\[(][^\W\d]+[\])])")
-"""The space in "X [m]", which does not separate columns."""
-_AXIS = re.compile(r"([xyz])(\s*[\[(].*[\])]|[\s_/](m|mm|cm|km|ft|in))?", re.IGNORECASE)
+from jaxreg.io.contents import Scan
+from jaxreg.io.decoding import decoded, number
+from jaxreg.io.layout import Layout, is_data, lines, recognised, split, uncommented
+
+SUFFIXES = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzn", ".xyzrgb", ".xyzi", ".dat")
+WRITABLE = (".xyz", ".txt", ".csv", ".asc")
+_GRID = re.compile(r"\s*ncols\s+\d+\s+nrows\s+\d+", re.IGNORECASE)
 
 
-def read(path: Path) -> np.ndarray:
+def read(path: Path) -> Scan:
     """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
 
-    Columns x, y, z if a header names them, also in a comment above the points and with units ("X
-    [m]"); without a header the first three. Other columns are ignored. A header that has a name for
-    every column, and none of x, y, z, is an error. Other comments are skipped, and so is a first
-    line with nothing but the number of points.
+    Separated by blanks, tabs, commas, semicolons or bars; the decimal mark is a point or a comma.
+    Columns x, y, z where a header names them, also in a comment above the points, with units ("X
+    [m]"), or as a surveyor does (Easting, Northing, Elevation); without a header the first three
+    columns of numbers. A header that has a name for every column, and none of these, is an error, and
+    so is a first column that seems to number the points. Other comments are skipped, and so are lines
+    with nothing but the number of points that follow. An empty field or "-nan(ind)" is NaN.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
+    text = decoded(path, path.read_bytes())
+    if _GRID.match(text):
         raise ValueError(
-            f"{path} is not a text file: give it the suffix of its format, or export it as text."
-        ) from None
-    numbered = [(number, line) for number, line in enumerate(lines, start=1) if _is_data(line)]
-    if not numbered:
-        return np.empty((0, 3))
-    sample = numbered[min(1, len(numbered) - 1)][1].split("#")[0]
-    separator = _separator(sample)
-    first = _split(numbered[0][1], separator)
-    headed = not _is_number(first[0])
-    above = numbered[0][0] - (0 if headed else 1)
-    head = [(number, line) for number, line in enumerate(lines[:above], start=1) if line.strip()]
-    columns = _columns(path, head, separator, len(_split(sample, separator)))
-    if headed or (len(first) == 1 and len(numbered) == int(float(first[0])) + 1):
-        numbered = numbered[1:]
-    if not numbered:
-        return np.empty((0, 3))
-    try:
-        text = "\n".join(line for _, line in numbered)
-        return np.loadtxt(io.StringIO(text), delimiter=separator, usecols=columns, ndmin=2)
-    except ValueError:
-        raise ValueError(_fault(path, numbered, separator, columns)) from None
+            f"{path} is a grid of heights (ESRI), not a list of points: convert it first, as in "
+            "gdal_translate -of XYZ grid.asc points.xyz."
+        )
+    layout = recognised(path, text)
+    if layout is None:
+        return Scan(np.empty((0, 3)))
+    return Scan(_points(path, text, layout))
 
 
 def write(path: Path, points: np.ndarray) -> None:
@@ -57,100 +45,107 @@ def write(path: Path, points: np.ndarray) -> None:
     np.savetxt(path, points, fmt="%.12g", delimiter=delimiter, header=header, comments="")
 
 
-def _is_data(line: str) -> bool:
-    stripped = line.strip()
-    return bool(stripped) and not stripped.startswith(_COMMENTS)
+def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
+    """Write a text file again with its points (and normals) moved and everything else kept.
+
+    Columns stay in their order, rows without a point and comments as they are. To a ``.csv`` from
+    columns parted by blanks, commas part them. The text becomes UTF-8.
+    """
+    text = decoded(original, original.read_bytes())
+    layout = recognised(original, text)
+    if layout is None:
+        raise ValueError(f"{original} contains no points: choose another file.")
+    moved = iter(_points(original, text, layout) @ rotation.T + translation)
+    commas = path.suffix.lower() == ".csv" and layout.separator is None and not layout.comma
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        for count, line in lines(text):
+            new = line
+            if count >= layout.first and is_data(line) and not _counts(line, layout):
+                new = _replaced(line, layout, next(moved), rotation)
+            if commas and is_data(line) and not _counts(line, layout):
+                new = ",".join(new.split())
+            file.write(new + "\n")
 
 
-def _separator(line: str) -> str | None:
-    """The separator in the line; None is any run of spaces and tabs."""
-    return next((mark for mark in (";", ",") if mark in line), None)
+def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray) -> str:
+    parts = re.split(r"(\s+)", line) if layout.separator is None else line.split(layout.separator)
+    # Between the fields of blanks stand the blanks; before the first may stand some, too.
+    places = [i for i, part in enumerate(parts) if layout.separator or part.strip()]
+    new = dict(zip(layout.columns, point, strict=True)) if np.isfinite(point).all() else {}
+    if layout.normals and new:
+        fields = [parts[places[c]].strip().strip('"') for c in layout.normals]
+        vector = [number(field, comma=layout.comma) for field in fields]
+        if None not in vector:
+            new |= dict(zip(layout.normals, rotation @ np.array(vector, float), strict=True))
+    for column, value in new.items():
+        digits = f"{value:.12g}"
+        parts[places[column]] = digits.replace(".", ",") if layout.comma else digits
+    return (layout.separator or "").join(parts)
 
 
-def _split(line: str, separator: str | None) -> list[str]:
-    return [field.strip().strip('"') for field in line.strip().split(separator)]
-
-
-def _is_number(field: str) -> bool:
+def _points(path: Path, text: str, layout: Layout) -> np.ndarray:
+    if ".#" in text or ",#" in text:  # which numpy would take for the begin of a remark
+        return _slowly(path, text, layout)
     try:
-        float(field)
+        points = np.loadtxt(
+            _plain(text, layout), delimiter=layout.separator, usecols=layout.columns, ndmin=2
+        )
     except ValueError:
-        return False
-    return True
+        return _slowly(path, text, layout)
+    if layout.count is not None and layout.count != len(points):
+        return _slowly(path, text, layout)
+    return points
 
 
-def _columns(path: Path, head: list, separator: str | None, width: int) -> tuple[int, ...]:
-    """Which of `width` columns are x, y, z, from the lines above the points, last line first.
-
-    Raises:
-      ValueError: a header names columns, but not x, y, z, or more than there are; or it is a line of
-        one or two words.
-    """
-    for _, line in reversed(head):
-        for names in _namings(line, separator):
-            axes = [_axis(name) for name in names]
-            wide = len(names) <= width if _is_data(line) else len(names) == width
-            if set("xyz") <= set(axes) and wide:
-                return tuple(axes.index(axis) for axis in "xyz")
-    for number, line in head:
-        names = _split(_joined(line, separator), separator)
-        if _is_data(line) and len(names) < 3:
-            raise ValueError(
-                f"{path}, line {number}: '{' '.join(names)}' is not a point: write x y z on each line."
-            )
-        if _is_data(line) and len(names) > width and set("xyz") <= set(map(_axis, names)):
-            raise ValueError(
-                f"{path}, line {number}: the header has {len(names)} names for {width} columns: "
-                "separate them as the columns are separated, with no spaces inside a name."
-            )
-        # A comment is a header only on the first line, and not if it is a remark like "by: me".
-        titled = number == head[0][0] and all(_is_name(name) for name in names)
-        titled = titled and not _LABEL.match(_joined(line, separator))
-        if len(names) == width >= 3 and (_is_data(line) or titled):
-            raise ValueError(
-                f"{path}, line {number}: the header names the columns {', '.join(names)[:80]}, "
-                "not x, y, z: name the columns x, y, z, or remove the header."
-            )
-    return (0, 1, 2)
+def _plain(text: str, layout: Layout) -> Iterator[str]:
+    for count, line in lines(text):
+        if count >= layout.first and is_data(line):
+            yield line.replace(",", ".") if layout.comma else line
 
 
-def _namings(line: str, separator: str | None) -> list[list[str]]:
-    """The names in a line: split as the points are, or as the line itself suggests.
-
-    By tabs first, because a name may then contain spaces ("Point ID").
-    """
-    text = _LABEL.sub("", _joined(line, separator))
-    own = _separator(text)
-    by_tabs = [_split(text, "\t")] if "\t" in text and not separator else []
-    return [*by_tabs, _split(text, separator), _split(_joined(text, own), own)]
-
-
-def _joined(line: str, separator: str | None) -> str:
-    """A line without its comment mark, and with units joined to names if spaces separate columns."""
-    text = line if _is_data(line) else _MARK.sub("", line)
-    return text if separator else _UNIT.sub("", text)
+def _slowly(path: Path, text: str, layout: Layout) -> np.ndarray:
+    """Row by row: with what numpy does not take for a number, and with counts between the rows."""
+    values, announced = array.array("d"), (layout.count, 0, layout.first - 1)
+    for count, line in lines(text):
+        if count < layout.first or not is_data(line):
+            continue
+        if _counts(line, layout):
+            _check_count(path, announced, len(values) // 3)
+            announced = (int(line), len(values) // 3, count)
+            continue
+        values.extend(_row(f"{path}, line {count}", line, layout))
+    _check_count(path, announced, len(values) // 3)
+    return np.array(values).reshape(-1, 3)
 
 
-def _axis(name: str) -> str:
-    match = _AXIS.fullmatch(name)
-    return match[1].lower() if match else ""
+def _counts(line: str, layout: Layout) -> bool:
+    """Whether a line holds a number of points and nothing else."""
+    return layout.count is not None and line.strip().isdigit()
 
 
-def _is_name(field: str) -> bool:
-    return any(letter.isalpha() for letter in field) and not _is_number(field)
+def _check_count(path: Path, announced: tuple[int | None, int, int], found: int) -> None:
+    count, before, line = announced
+    if count is not None and found - before != count:
+        raise ValueError(
+            f"{path}: line {line} announces {count} points and {found - before} follow: copy the "
+            "file again, or remove that line if the points are right."
+        )
 
 
-def _fault(path: Path, numbered: list, separator: str | None, columns: tuple[int, ...]) -> str:
-    for number, line in numbered:
-        fields = _split(line, separator)
-        if len(fields) <= max(columns):
-            return (
-                f"{path}, line {number}: '{line.strip()[:60]}' has {len(fields)} column(s), but a "
-                "point needs 3: complete or remove the line."
-            )
-        bad = [fields[c] for c in columns if not _is_number(fields[c])]
-        if bad:
-            return (
-                f"{path}, line {number}: '{bad[0][:40]}' is not a number: fix or remove the line."
-            )
-    return f"{path} cannot be read as text with one point per line: export it again."
+def _row(where: str, line: str, layout: Layout) -> list[float]:
+    fields = split(uncommented(line), layout.separator)
+    if len(fields) <= max(layout.columns):
+        raise ValueError(
+            f"{where}: '{line.strip()[:60]}' has {len(fields)} column(s), but a point needs "
+            f"{max(layout.columns) + 1}: complete or remove the line."
+        )
+    row = []
+    for column in layout.columns:
+        value = number(fields[column], comma=layout.comma)
+        if value is None:
+            hint = "fix or remove the line"
+            if re.fullmatch(r"[+-]?\d+,\d+", fields[column]):
+                hint = "if the comma is a decimal mark, write all numbers with decimal points"
+            raise ValueError(f"{where}: '{fields[column][:40]}' is not a number: {hint}.")
+        row.append(value)
+    return row

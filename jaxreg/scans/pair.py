@@ -16,7 +16,7 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import probabilities
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, prepare, verdict
+from jaxreg.scans import candidates, diagnosis, prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
 from jaxreg.search.config import SearchConfig
@@ -320,7 +320,7 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
         probability=chance,
         reason=""
         if chance >= verdict.TRUSTED
-        else verdict.reason(judged, weak, float(chances[1:].sum())),
+        else _reason(problem, judged, weak, float(chances[1:].sum())),
         overlap=_overlap(problem, refined.transform),
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
@@ -331,6 +331,20 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
         evidence=judged,
         converged=refined.converged,
         dropped=int(np.sum(~source.kept) + np.sum(~problem.reference.kept)),
+    )
+
+
+def _reason(
+    problem: Problem, judged: Evidence, weak: tuple[WeakDirection, ...], rivals: float
+) -> str:
+    """Why the pose is not trusted, and whether the clouds seem to be in different units."""
+    source, reference = (c.points * c.radius for c in (problem.source, problem.reference))
+    units = diagnosis.compared(source, reference, least=3.0)
+    return " ".join(
+        [
+            verdict.reason(judged, weak, rivals),
+            *(f"{told[:1].upper()}{told[1:]}." for told in units),
+        ]
     )
 
 

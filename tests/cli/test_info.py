@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from jaxreg import io
 from jaxreg.cli.options import BAD_INPUT, SUCCESS
@@ -28,3 +29,15 @@ def test_clouds_without_a_finite_point(tmp_path, run):
     for command in ("info", "view"):
         status, _, err = run(command, tmp_path / "nan.npy")
         assert (status, "contains no finite point" in err) == (BAD_INPUT, True)
+
+
+def test_info_says_what_is_odd_and_what_a_file_is(tmp_path, run):
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.ply")
+    status, out, _ = run("info", tmp_path / "box.ply")
+    assert status == SUCCESS
+    assert "read as          a mesh of 12 triangles, sampled over its surface\n" in out
+    assert "points           20,000\n" in out
+    cloud = np.random.default_rng(0).normal(size=(2000, 3)) + [452000, 5411000, 250]
+    io.write_cloud(tmp_path / "utm.npy", cloud.astype(np.float32).astype(float))
+    _, out, _ = run("info", tmp_path / "utm.npy")
+    assert "note             y comes in steps of 0.5 beside" in out

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
 from plyfile import PlyData
 from scipy.spatial import cKDTree
@@ -241,3 +242,58 @@ def test_first_process_says_that_it_compiles_and_the_second_need_not(folder, tmp
     ]
     assert timeless[0] == timeless[1]
     assert (tmp_path / "jaxreg" / "xla").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_mesh_goes_out_as_a_mesh_and_both_are_told(folder, tmp_path, run, truth):
+    box = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((4, 2, 1)),
+            trimesh.creation.box((1, 1, 3)).apply_translation([1, 0, 2]),
+        ]
+    )
+    box.export(tmp_path / "a.ply")
+    moved = box.sample(2000, seed=0) @ truth[:3, :3].T + truth[:3, 3]
+    io.write_cloud(tmp_path / "b.npy", moved)
+    files = (tmp_path / "a.ply", tmp_path / "b.npy", "--initial", folder / "T.txt")
+    status, out, _ = run("register", *files, "--refine", "none", "-o", tmp_path / "o.stl")
+    assert status == SUCCESS
+    assert "(20,000 points; a mesh of 24 triangles, sampled over its surface)" in out
+    found = trimesh.load(tmp_path / "o.stl")
+    assert len(found.faces) == 24
+    expected = box.apply_transform(truth)
+    np.testing.assert_allclose(found.bounds, expected.bounds, atol=1e-5)
+
+
+def test_columns_are_kept_or_their_loss_is_told(folder, tmp_path, run):
+    points = io.read_cloud(folder / "a.ply")
+    rows = "".join("{:.4f},{:.4f},{:.4f},51\n".format(*row) for row in points)
+    (tmp_path / "a.csv").write_text("x,y,z,red\n" + rows)
+    start = ("--initial", folder / "T.txt", "--refine", "none", "-o")
+    for source, out, told in (
+        (tmp_path / "a.csv", tmp_path / "o.csv", ""),
+        (
+            folder / "a.ply",
+            tmp_path / "o.pcd",
+            "note             .pcd gets coordinates alone; .ply",
+        ),
+    ):
+        status, text, _ = run("register", source, folder / "b.pcd", *start, out)
+        assert status == SUCCESS
+        assert told in text
+    assert (tmp_path / "o.csv").read_text().startswith("x,y,z,red\n")
+    assert {line.split(",")[3] for line in (tmp_path / "o.csv").read_text().split()[1:]} == {"51"}
+
+
+def test_clouds_in_different_units_are_told(folder, tmp_path, run):
+    io.write_cloud(tmp_path / "mm.npy", 1000 * io.read_cloud(folder / "b.pcd"))
+    start = ("--initial", folder / "T.txt", "--refine", "none")
+    status, out, _ = run("register", folder / "a.ply", tmp_path / "mm.npy", *start)
+    assert status == NOT_TRUSTED
+    assert "times the size of the source: are their units metres and millimetres?" in out
+
+
+def test_a_cloud_cannot_become_a_mesh(folder, tmp_path, run):
+    files = (folder / "a.ply", folder / "b.pcd")
+    status, out, err = run("register", *files, "-o", tmp_path / "o.stl")
+    assert (status, out) == (BAD_INPUT, "")
+    assert "which holds surfaces, and" in err

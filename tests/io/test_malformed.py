@@ -44,16 +44,16 @@ CASES = {
     "two-columns.xyz": (b"1 2 3\n4 5\n6 7 8\n", "line 2"),
     "word.txt": (b"# head\n1 2 3\n4 5 six\n", "line 3"),
     "one-word.txt": (b"hello\n1 2 3\n", "line 1"),
-    "names.csv": (b"id,a,b,c\n7,1,2,3\n", "line 1: .* id, a, b, c, .*remove the header"),
-    "no-z.csv": (b"x,y,height\n1,2,3\n", "x, y, height, not x, y, z"),
-    "names.txt": (b"# id,a,b,c\n7,1,2,3\n8,4,5,6\n", "id, a, b, c.*name the columns x, y, z"),
+    "names.csv": (b"id,a,b,c\n7,1,2,3\n", "line 1: .* id, a, b, c, .*call those that hold"),
+    "no-z.csv": (b"x,y,time\n1,2,3\n", "x, y, time, not x, y, z"),
+    "names.txt": (b"# id,a,b,c\n7,1,2,3\n8,4,5,6\n", "id, a, b, c.*call those that hold"),
     "slashes.txt": (b"\n//R G B\n1 2 3\n4 5 6\n", "line 2: .* R, G, B"),
-    "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"remove the header"),
+    "units.txt": (b"a [m] b [m] c [m]\n1 2 3\n4 5 6\n", r"a\[m\], b\[m\], c\[m\], not x, y, z"),
     "blank-in-name.txt": (
         b"Point ID X Y Z Intensity\n1 2 3 4 5\n6 7 8 9 10\n",
         "line 1: the header has 6 names for 5 columns",
     ),
-    "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", "remove the header"),
+    "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", ", 0, 1, 2, not x, y, z"),
     "binary.txt": (b"\xff\xfe\x00\x81" * 10, "not a text file"),
     "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),
     "word.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n4 x 6\n7 8 9\n", "point 1"),
@@ -86,7 +86,7 @@ def test_malformed_file_is_named_with_place_and_remedy(tmp_path, name):
     assert name in str(caught.value)
 
 
-@pytest.mark.parametrize("suffix", [*io.WRITABLE, ".obj", ".off", ".stl"])
+@pytest.mark.parametrize("suffix", [*io.WRITABLE, ".obj", ".off", ".stl", ".glb"])
 def test_damaged_files_are_read_or_refused_by_name(tmp_path, seed, suffix):
     """Cut anywhere, or with bytes changed: a cloud or a ValueError, and nothing else."""
     rng = np.random.default_rng(seed)

@@ -1,0 +1,13 @@
+"""What a file holds besides its points: one record for every format."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Scan(NamedTuple):
+    """The points of a file, and what a reader of them should know ("a mesh of 12 faces ...")."""
+
+    points: Float[np.ndarray, "n 3"]
+    notes: tuple[str, ...] = ()
