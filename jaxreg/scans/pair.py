@@ -212,8 +212,8 @@ def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
     found = searched_and_judged(problem, most, config.search)
     if config.wide is not None and probabilities(found.score).max() < _SURE:
         found = candidates.merged(found, searched_and_judged(problem, most, config.wide))
-        if (closer := _closer(problem)) and probabilities(found.score).max() < _SURE:
-            found = candidates.merged(found, searched_and_judged(closer, most, config.wide))
+        if (nearer := closer(problem)) and probabilities(found.score).max() < _SURE:
+            found = candidates.merged(found, searched_and_judged(nearer, most, config.wide))
     turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
     # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
     # the others is at least an answer.
@@ -225,7 +225,7 @@ def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
     return _Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
 
 
-def _closer(problem: Problem) -> Problem | None:
+def closer(problem: Problem) -> Problem | None:
     """The pair in the unit of the smaller cloud and at the density that shows it, if sizes differ."""
     radii = sorted((problem.source.radius, problem.reference.radius))
     if radii[1] < _UNLIKE_SIZES * radii[0]:
