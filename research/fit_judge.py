@@ -12,6 +12,7 @@ alike, whatever its size. Then it fits again without each of the sensors and jud
 """
 
 import dataclasses
+import functools
 import pickle
 from pathlib import Path
 
@@ -85,10 +86,12 @@ def judged_poses(found: sensors.TruePair) -> dict:
     config = RegisterConfig()
     clouds = [prepare.prepare(cloud, config=config) for cloud in (found.source, found.reference)]
     problem = pair.pose_problem(*clouds, config)
-    both = [
+    searches = [
         pair.searched_and_judged(problem, np.pi, search) for search in (config.search, config.wide)
     ]
-    judged = candidates.merged(*both)
+    if nearer := pair.closer(problem):
+        searches.append(pair.searched_and_judged(nearer, np.pi, config.wide))
+    judged = functools.reduce(candidates.merged, searches)
     poses = [
         pair.frame.transform_out(problem.where, RigidTransform(*pose))
         for pose in zip(*judged.poses, strict=True)
@@ -101,7 +104,6 @@ def judged_poses(found: sensors.TruePair) -> dict:
         "evidence": values,
         "exact": np.array([found.is_right(pose) for pose in poses]),
         "right": np.array([found.is_right(pose, _NEAR) for pose in poses]),
-        "first": len(both[0].score),
     }
 
 

@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg.judge.evidence import Evidence
 
-INTERCEPT = 12.0
+INTERCEPT = 4.418
 WEIGHTS = Evidence(
-    smaller=2.24, larger=-1.68, distance=-1.77, rough_distance=-4.45, rough_facing=-7.4,
-    disagreement=-7.54, beside=0.0, unseen=-29.9, rough=0.0, ends=0.0, held=3.98,
+    smaller=4.344, larger=-0.818, distance=-2.948, rough_distance=-2.833, rough_facing=-5.063,
+    disagreement=-15.074, beside=4.738, unseen=-27.314, rough=4.019, ends=18.089, held=4.438,
 )  # fmt: skip
 """What one unit of every feature adds to the log odds."""
 

@@ -14,7 +14,7 @@ from jaxreg.geometry.rigid import nearest_rotation
 from jaxreg.refine.config import RefineConfig, check_options
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud, iterate
 from jaxreg.refine.robust import Weighting
-from jaxreg.refine.uncertainty import PoseUncertainty, uncertainty_of_pairs
+from jaxreg.refine.uncertainty import PoseUncertainty, scan_covariance, uncertainty_of_pairs
 from jaxreg.types import RigidTransform
 
 
@@ -138,4 +138,6 @@ def _uncertainty(
     zero = jnp.zeros(3, x.dtype)
     where = frame.Frame(zero, zero, jnp.ones((), x.dtype))
     weighting = Weighting(kernel, None, distance, trim)
-    return uncertainty_of_pairs(where, moved, y, normals, pairs, weighting)
+    found = uncertainty_of_pairs(where, moved, y, normals, pairs, weighting)
+    covariance = scan_covariance(moved, y, normals, pairs, weighting, zero)
+    return found._replace(covariance=jnp.where(found.weight > 0, covariance, 0))

@@ -45,13 +45,25 @@ def pair_weights(
     mask = counting_pairs(squared_distance, mask, weighting)
     if weighting.kernel == "none":
         return mask.astype(squared_residual.dtype)
-    if weighting.kernel_scale is None:
-        median = masked_quantile(squared_residual, mask, 0.5)
-        variance = jnp.maximum(1.4826**2 * median, _SMALLEST_SCALE**2)
-    else:
-        variance = weighting.kernel_scale**2
+    variance = _kernel_variance(squared_residual, mask, weighting)
     relative = squared_residual / (variance * widening**2)
     return jnp.where(mask, kernel_weight(relative, weighting.kernel), 0)
+
+
+def pair_curvatures(
+    squared_residual: Float[Array, "p"], counts: Bool[Array, "p"], weighting: Weighting
+) -> Float[Array, "p"]:
+    """``rho''(u) = w + 2 u^2 dw/du^2`` of every pair that counts, at the final width of the kernel.
+
+    How much a pair resists a change of its residual: less than its weight, and below 0 in the tail
+    of a kernel that gives outliers up.
+    """
+    variance = _kernel_variance(squared_residual, counts, weighting)
+    relative = jax.lax.stop_gradient(squared_residual / variance)
+    weight, slope = jax.jvp(
+        lambda u: kernel_weight(u, weighting.kernel), (relative,), (jnp.ones_like(relative),)
+    )
+    return jnp.where(counts, weight + 2 * relative * slope, 0)
 
 
 def counting_pairs(
@@ -67,6 +79,16 @@ def counting_pairs(
         limit = masked_quantile(squared_distance, mask, weighting.trim)
         mask = mask & (squared_distance <= limit)
     return mask
+
+
+def _kernel_variance(
+    squared_residual: Float[Array, "p"], counts: Bool[Array, "p"], weighting: Weighting
+) -> Float[Array, ""] | float:
+    """The square of the kernel's final width."""
+    if weighting.kernel_scale is not None:
+        return weighting.kernel_scale**2
+    median = masked_quantile(squared_residual, counts, 0.5)
+    return jnp.maximum(1.4826**2 * median, _SMALLEST_SCALE**2)
 
 
 def kernel_weight(squared: Float[Array, "p"], kernel: str) -> Float[Array, "p"]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.neighbors import knn
@@ -19,7 +19,7 @@ from jaxreg.refine.correspondences import Pairs, closest_pairs
 from jaxreg.refine.cost import Scene, match
 from jaxreg.refine.gauss_newton import normal_equations
 from jaxreg.refine.point_to_plane import POINT_TO_PLANE
-from jaxreg.refine.robust import Weighting
+from jaxreg.refine.robust import Weighting, pair_curvatures
 from jaxreg.refine.solve import set_up
 from jaxreg.types import RigidTransform
 
@@ -29,6 +29,15 @@ mean square (1/3 for surfaces that face all directions)."""
 _SMALLEST_EIGENVALUE = 1e-6
 """Floor of the eigenvalues of the information matrix, relative to the largest: a free motion has a
 huge variance instead of an infinite one."""
+_BOTH_NOISY = 1.9
+"""Variance of a pose between two scans, for 1 if only the source were noisy. Two where a reference
+point tells as much as a source point; planes average over the reference's."""
+_PATCH = 30
+"""Pairs of a patch: about twice the neighbours that share a plane."""
+_BINS = 1024
+"""Numbers for patches."""
+_LEAST_CURVATURE = 0.1
+"""Of E[psi']; below it the residuals are all outliers."""
 _PITCH = 0.1
 """Translation along the axis per radian, in radii of the cloud, that makes a rotation a screw."""
 
@@ -147,6 +156,58 @@ def uncertainty_of_pairs(
         centre=where.reference_centre,
         length=where.length,
     )
+
+
+def scan_covariance(
+    moved: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    reference_normals: Float[Array, "m 3"],
+    pairs: Pairs,
+    weighting: Weighting,
+    centre: Float[Array, "3"],
+) -> Float[Array, "6 6"]:
+    """Covariance of a pose between two *scans*, about `centre`: positive definite.
+
+    `PoseUncertainty.covariance` takes the reference for exact and the residuals for independent. Of
+    two scans both are noisy samples, and neighbouring points share what is wrong about a plane, so
+    this is the covariance of an M-estimator whose errors come in patches (Liang and Zeger, 1986):
+
+        B^-1 (c / (c - 6) sum_k g_k g_k^T) B^-1 * _BOTH_NOISY,
+
+    with ``g_k`` the sum of ``psi(r_i) J_i^T n_i`` over patch k, about _PATCH pairs, and
+    ``B = E[psi'] sum_i J_i^T n_i n_i^T J_i``.
+    """
+    scene = Scene(moved - centre, reference - centre, None, reference_normals, weighting)
+    pose = rigid.identity(moved.dtype)
+    weighed = match(scene, pose, pairs, POINT_TO_PLANE)
+    counts = weighed.counts
+    number = jnp.maximum(jnp.sum(counts), 1).astype(moved.dtype)
+    curvature = jnp.sum(pair_curvatures(weighed.squared, counts, weighting)) / number
+    plain = weighting._replace(kernel="none", kernel_scale=None)
+    even = match(scene._replace(weighting=plain), pose, pairs, POINT_TO_PLANE)
+    stiffness, _ = normal_equations(even.moved, even.target, even.metric)
+    bread = _bounded_inverse(stiffness) / jnp.maximum(curvature, _LEAST_CURVATURE)
+    force = jnp.einsum("pij,pj->pi", weighed.metric, weighed.moved - weighed.target)
+    slopes = jnp.concatenate([jnp.cross(weighed.moved, force), force], axis=1)
+    spread = jnp.sqrt(jnp.sum(jnp.where(counts[:, None], weighed.moved**2, 0)) / number)
+    patch = _patches(weighed.moved, spread * jnp.sqrt(_PATCH * 12 / number))
+    ones = counts.astype(moved.dtype)
+    filled = jnp.sum(jax.ops.segment_sum(ones, patch, _BINS) > 0)
+    sums = jax.ops.segment_sum(slopes * ones[:, None], patch, _BINS)
+    meat = jnp.matmul(sums.T, sums, precision="highest") * filled / jnp.maximum(filled - 6, 1)
+    covariance = jnp.matmul(
+        jnp.matmul(bread, meat, precision="highest"), bread, precision="highest"
+    )
+    # Exact copies leave no residual, only the rounding of their coordinates.
+    rounding = (10 * jnp.finfo(moved.dtype).eps * spread) ** 2
+    return _BOTH_NOISY * (covariance + covariance.T) / 2 + rounding * _bounded_inverse(stiffness)
+
+
+def _patches(points: Float[Array, "n 3"], edge: Float[Array, ""]) -> Int[Array, "n"]:
+    """A number for the cube of an `edge` that a point lies in; some cubes share one."""
+    cell = jnp.floor(points / jnp.maximum(edge, 1e-12)).astype(jnp.int32)
+    mixed = cell * jnp.array([73856093, 19349663, 83492791], jnp.int32)
+    return (mixed[:, 0] ^ mixed[:, 1] ^ mixed[:, 2]) & (_BINS - 1)
 
 
 def weak_directions(

@@ -31,6 +31,8 @@ _TURN_COST = 0.2
 symmetric shape) the one that turns least is taken."""
 _SURE = 0.9
 """Probability at which the search ends, because an easy pair needs no wider one."""
+_UNLIKE_SIZES = 2.0
+"""Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
 _LISTED = 0.01
@@ -94,12 +96,16 @@ class ScanRegistration:
 
 
 class Problem(NamedTuple):
-    """Two prepared clouds in one frame; points within `distance` count as the same."""
+    """Two prepared clouds in one frame; points within `distance` count as the same.
+
+    `levels` and `unit` are what the search compares, and its unit in that of the input.
+    """
 
     source: Prepared
     reference: Prepared
     where: frame.Frame
     levels: tuple[prepare.Level, prepare.Level]
+    unit: float
     spacing: float
     distance: float
     config: RegisterConfig
@@ -195,7 +201,9 @@ def pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) 
         prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides)
     )
     distance = config.inlier_spacings * spacing
-    return Problem(source, reference, where, levels, spacing, distance, config)
+    # Twice the radius: a usual shape then fills the unit sphere.
+    unit = prepare.in_steps(2 * length)
+    return Problem(source, reference, where, levels, unit, spacing, distance, config)
 
 
 def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
@@ -204,6 +212,8 @@ def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
     found = searched_and_judged(problem, most, config.search)
     if config.wide is not None and probabilities(found.score).max() < _SURE:
         found = candidates.merged(found, searched_and_judged(problem, most, config.wide))
+        if (nearer := closer(problem)) and probabilities(found.score).max() < _SURE:
+            found = candidates.merged(found, searched_and_judged(nearer, most, config.wide))
     turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
     # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
     # the others is at least an answer.
@@ -213,6 +223,15 @@ def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
     poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
     others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
     return _Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
+
+
+def closer(problem: Problem) -> Problem | None:
+    """The pair in the unit of the smaller cloud and at the density that shows it, if sizes differ."""
+    radii = sorted((problem.source.radius, problem.reference.radius))
+    if radii[1] < _UNLIKE_SIZES * radii[0]:
+        return None
+    levels = prepare.at_fine_density(problem.source, problem.reference)
+    return problem._replace(levels=levels, unit=prepare.in_steps(2 * radii[0]))
 
 
 def searched_and_judged(problem: Problem, most: float, search: SearchConfig) -> candidates.Judged:
@@ -234,13 +253,13 @@ def _searched_poses(
     problem: Problem, most: float, search: SearchConfig, learned: bool
 ) -> tuple[RigidTransform, np.ndarray]:
     """The poses of the search in the pair's frame (float64), and their scores; the allowed ones."""
-    where = problem.where
-    # Twice the radius: a usual shape then fills the unit sphere.
-    unit = prepare.in_steps(2 * float(where.length))
-    size = padded_size(max(len(level.points) for level in problem.levels), smallest=_SMALLEST)
+    where, unit = problem.where, problem.unit
+    sizes = [padded_size(len(level.points), smallest=_SMALLEST) for level in problem.levels]
+    # One size for both, so that few programs are compiled, unless one cloud is far larger.
+    sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
+    sides = zip(problem.levels, sizes, (problem.source, problem.reference), strict=True)
     described = (
-        level.described(unit / cloud.radius, size, search.radii)
-        for level, cloud in zip(problem.levels, (problem.source, problem.reference), strict=True)
+        level.described(unit / cloud.radius, size, search.radii) for level, size, cloud in sides
     )
     unmoved = frame.transform_in(
         where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3))

@@ -164,14 +164,24 @@ def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]
 
     Counts around a point depend on the density, and clouds are compared by such counts.
     """
-    clouds = (source, reference)
-    spacings = [cloud.coarse.spacing * cloud.radius for cloud in clouds]
+    return _alike(source, reference, source.coarse, reference.coarse)
+
+
+def at_fine_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]:
+    """The same of the fine levels: a small scan in a large one is a few points of a coarse level."""
+    return _alike(source, reference, source.fine, reference.fine)
+
+
+def _alike(source: Prepared, reference: Prepared, one: Level, other: Level) -> tuple[Level, Level]:
+    clouds, levels = (source, reference), (one, other)
+    sides = list(zip(levels, clouds, strict=True))
+    spacings = [level.spacing * cloud.radius for level, cloud in sides]
     size = in_steps(max(spacings))
-    one, other = (
-        cloud.thinned(size) if _UNALIKE * spacing < max(spacings) else cloud.coarse
-        for cloud, spacing in zip(clouds, spacings, strict=True)
+    first, second = (
+        cloud.thinned(size) if _UNALIKE * spacing < max(spacings) else level
+        for spacing, (level, cloud) in zip(spacings, sides, strict=True)
     )
-    return one, other
+    return first, second
 
 
 def in_steps(value: float) -> float:
