@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from benchmarks import figures
+from benchmarks import figures, search_figure
 from jaxreg.config import PairConfig
+from jaxreg.types import RigidTransform
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
 
@@ -48,3 +49,10 @@ def test_the_drift_of_runs_is_read_from_their_logs(tmp_path):
     options = figures.Options(folder=str(tmp_path), only=("drift",), runs=runs)
     figures.draw("drift", options)
     assert imread(tmp_path / "drift.png").shape[1] == 1080
+
+
+def test_a_pose_that_repeats_another_is_not_counted():
+    shift = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.2, 0, 0], [0.2, 0, 0]])
+    turn = np.stack([np.eye(3)] * 3 + [np.diag([1.0, -1, -1])])
+    counted = search_figure.distinct(RigidTransform(turn, shift))
+    np.testing.assert_array_equal(counted, [True, False, True, True])
