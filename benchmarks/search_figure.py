@@ -132,13 +132,13 @@ def _draw_judged(axes: Axes, stages: Stages) -> None:
     rows, near = np.arange(len(stages.score)), stages.best_angle_deg < 15
     axes.barh(rows, stages.score, color=np.where(near, RIGHT, WRONG), height=0.7)
     for row, score, chance in zip(rows, stages.score, stages.probability, strict=True):
-        text = f"{chance:.2f}" if chance else "same as a better one"
+        text = f"{chance:.2f}" if chance else "as a better one"
         place = (
             {"ha": "left", "xytext": (5, 0)} if score >= 0 else {"ha": "right", "xytext": (-5, 0)}
         )
         axes.annotate(text, (score, row), va="center", textcoords="offset points", **place)
     axes.axvline(0, color="black", lw=0.8)
-    axes.margins(x=0.2)
+    axes.margins(x=0.3)
     axes.set_yticks(rows, [f"{angle:.0f}°" for angle in stages.best_angle_deg])
     axes.set(
         ylabel="away from the true pose", xlabel="log odds, and the probability beside the bar"
