@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.judge.surface import Examined, every
 from jaxreg.types import RigidTransform
 
@@ -80,7 +81,8 @@ def read_evidence(
     """
     turned = pose.rotation.T
     moved = source._replace(
-        points=jnp.matmul(source.points, turned, precision=Precision.HIGHEST) + pose.translation,
+        points=jnp.matmul(source.points, turned, precision=Precision.HIGHEST)
+        + pose.translation[None, :],
         normals=jnp.matmul(source.normals, turned, precision=Precision.HIGHEST),
     )
     spacing = jnp.maximum(source.spacing, reference.spacing)
@@ -89,7 +91,8 @@ def read_evidence(
     other = _one_way(fewer, moved, back, spacing)
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
     near, rough = both.near, both.near & both.rough
-    shares = [_share(side.near, cloud.mask) for side, cloud in ((one, few), (other, fewer))]
+    shares = [_share(side, cloud.mask) for side, cloud in ((one, few), (other, fewer))]
+    seen = _count(near, both.across)
     off = (both.across > _APART) | (both.cosine < _ACROSS)
     return Evidence(
         smaller=jnp.minimum(*shares),
@@ -98,10 +101,10 @@ def read_evidence(
         rough_distance=_mean(both.across, rough, prior=1.0),
         rough_facing=_mean(both.cosine, rough, prior=0.5),
         disagreement=_sum(both.rarity, near & off) / (_sum(both.rarity, near) + _MORE),
-        beside=jnp.sum(both.beside) / (jnp.sum(near) + _MORE),
-        unseen=jnp.sum(both.unseen) / (jnp.sum(near) + _MORE),
-        rough=jnp.sum(rough) / (jnp.sum(near) + _FEW),
-        ends=_sum(both.ends, near) / (jnp.sum(near) + _MORE),
+        beside=_count(both.beside, both.across) / (seen + _MORE),
+        unseen=jnp.sum(both.unseen) / (seen + _MORE),
+        rough=_count(rough, both.across) / (seen + _FEW),
+        ends=_sum(both.ends, near) / (seen + _MORE),
         held=_held(few.points, reference.normals[there], one.near),
     )
 
@@ -142,11 +145,15 @@ def _sum(values: Array, chosen: Array) -> Array:
 
 
 def _mean(values: Array, chosen: Array, *, prior: float) -> Array:
-    return (_sum(values, chosen) + prior * _FEW) / (jnp.sum(chosen) + _FEW)
+    return (_sum(values, chosen) + prior * _FEW) / (_count(chosen, values) + _FEW)
 
 
-def _share(chosen: Array, mask: Array) -> Array:
-    return jnp.sum(chosen) / jnp.maximum(jnp.sum(mask), 1)
+def _share(side: _Side, mask: Array) -> Array:
+    return _count(side.near, side.across) / jnp.maximum(_count(mask, side.across), 1)
+
+
+def _count(chosen: Array, like: Array) -> Array:
+    return jnp.sum(chosen, dtype=like.dtype)
 
 
 def _held(
@@ -159,8 +166,9 @@ def _held(
     """
     weight = near.astype(points.dtype)
     count = jnp.maximum(jnp.sum(weight), 1)
-    centred = (points - jnp.sum(weight[:, None] * points, axis=0) / count) * weight[:, None]
-    radius = jnp.sqrt(jnp.sum(centred**2) / count) + 1e-12
+    centre = jnp.sum(weight[:, None] * points, axis=0) / count
+    centred = (points - centre[None, :]) * weight[:, None]
+    radius = safe_sqrt(jnp.sum(centred**2) / count) + 1e-12
     rows = jnp.concatenate([jnp.cross(centred / radius, normals), normals], axis=1)
     rows = rows * weight[:, None]
     mean = jnp.matmul(rows.T, rows, precision=Precision.HIGHEST) / count
