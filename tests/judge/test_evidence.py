@@ -7,10 +7,6 @@ import pytest
 
 from jaxreg.judge.evidence import Evidence, read_evidence
 from jaxreg.judge.surface import Examined
-from jaxreg.scans import prepare
-from jaxreg.scans.config import RegisterConfig
-from jaxreg.scans.pair import pose_problem
-from jaxreg.search.nearest import nearest_packed
 from jaxreg.types import RigidTransform
 from tests.judge.clouds import (
     arbitrary,
@@ -269,35 +265,3 @@ def test_derivatives_are_finite_even_where_points_coincide(rng):
     for known in (cloud, one_place):
         found = gradient((pose, known.points, known.normals), known)
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(found))
-
-
-@pytest.fixture
-def clouds(rng):
-    """Two samplings of other densities, as `register` prepares them."""
-    config = RegisterConfig(search_points=256)
-    sides = [prepare.prepare(shape(rng, n), config=config) for n in (520, 400)]
-    return pose_problem(*sides, config).clouds()
-
-
-@pytest.mark.parametrize("count", [1, 5])
-def test_the_trees_of_the_host_show_the_same_as_all_distances(rng, clouds, count):
-    """One definition: the poses of `register` are read as those of the search."""
-    poses = [random_pose(rng, angle=0.3, shift=0.1) for _ in range(count)]
-    found, score = clouds.judge(RigidTransform(*map(np.stack, zip(*poses, strict=True))))
-    assert score.shape == found.held.shape == (count,)
-    source, reference = (
-        cloud._replace(points=cloud.points * index.scale, spacing=cloud.spacing * index.scale)
-        for cloud, index in zip(clouds.examined, clouds[:2], strict=True)
-    )
-
-    @jax.jit
-    def exhaustive(pose):
-        moved = source.points @ pose.rotation.T + pose.translation[None]
-        there = nearest_packed(moved, reference.points, reference.mask)
-        back = nearest_packed(reference.points, moved, source.mask)
-        return read_evidence(pose, source, reference, there, back)
-
-    for i, pose in enumerate(poses):
-        expected = exhaustive(RigidTransform(*map(jnp.asarray, pose)))
-        assert 0 < expected.smaller < 1
-        assert_same(jax.tree.map(lambda x, i=i: x[i], found), expected, tolerance=1e-6)
