@@ -42,13 +42,14 @@ class Evidence(NamedTuple):
     the plane of their partner, in spacings, and `rough_distance` that of points whose surface is
     rough, there or at the partner; `rough_facing` is the mean cosine of the two normals there.
     `disagreement` is the share of near points that lie off the plane or face another way, the more
-    heavily weighed the rarer their direction is in their cloud (a wall agrees with every wall).
+    heavily weighed the rarer their direction is in their cloud (a wall agrees with every wall);
+    points without a normal, and those whose partner has none, do not count for it.
     Per near point, `beside` is the number of points that lie just off the other cloud, and `unseen`
     that of those just off its *interior*: if a scan does not end there, it should have seen these
     points, too. `rough` is the share of near points that are rough, `ends` the share whose partner
     lies where its surface ends. `held` is how strongly the
-    near surfaces resist the motion that they resist least; 1/3 for surfaces that face all
-    directions, 0 for a plane.
+    near surfaces resist the motion that they resist least; 4/15 for surfaces that face all
+    directions everywhere, 0 for a plane.
     """
 
     smaller: Float[Any, "*k"]
@@ -136,8 +137,13 @@ def _one_way(moved: Examined, other: Examined, partner: Int[Array, "n"], spacing
         rough=jnp.maximum(moved.variation, other.variation[partner]) > ROUGH,
         across=jnp.minimum(across, NEAR),
         cosine=jnp.abs(jnp.sum(moved.normals * normal, axis=1)),
-        rarity=moved.rarity,
+        # Where no normal is known, nothing faces another way.
+        rarity=jnp.where(_known(moved.normals) & _known(normal), moved.rarity, 0),
     )
+
+
+def _known(normals: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+    return jnp.any(normals != 0, axis=1)
 
 
 def _sum(values: Array, chosen: Array) -> Array:

@@ -27,11 +27,12 @@ def neighbors_of(points, k=NEIGHBORS):
 
 
 def arbitrary(rng, n, spacing) -> Examined:
-    """Points in the unit cube of which nothing else agrees with anything; some are padding."""
+    """Points in the unit cube of which nothing else agrees; some are padding, some lack a normal."""
     normals = rng.normal(size=(n, 3))
+    unknown = rng.uniform(size=(n, 1)) < 0.1
     return Examined(
         rng.uniform(size=(n, 3)),
-        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        np.where(unknown, 0, normals / np.linalg.norm(normals, axis=1, keepdims=True)),
         rng.uniform(0, 0.06, n),
         rng.uniform(1, 50, n),
         rng.uniform(0, 1, n),

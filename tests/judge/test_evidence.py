@@ -44,7 +44,7 @@ def one_way(rotation, shift, cloud, other, partner, step, spacing):
                 "across": off,
                 "cosine": cosine,
                 "disagrees": near and (off > 1 or cosine < 0.7),
-                "rarity": cloud.rarity[i],
+                "rarity": cloud.rarity[i] * bool(cloud.normals[i].any() and other.normals[j].any()),
                 "beside": 3 < far < 6,
                 "unseen": other.interior[j] if 2 < far < 6 else 0.0,
                 "ends": 1 - other.interior[j],
@@ -182,6 +182,7 @@ def test_a_surface_on_itself_agrees_whatever_the_sign_of_its_normals(rng):
     cloud = examined(shape(rng, 300))
     flipped = cloud._replace(normals=cloud.normals * rng.choice([-1.0, 1.0], (300, 1)))
     pairs = partners(IDENTITY, cloud, cloud)
+    assert not np.any(cloud.normals[225:], axis=1).all()  # a rod has none
     found = read(IDENTITY, cloud, flipped, *pairs)
     assert_same(found, read(IDENTITY, cloud, cloud, *pairs), tolerance=1e-6)
     assert found.smaller == found.larger == 1
