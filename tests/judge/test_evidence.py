@@ -54,7 +54,7 @@ def one_way(rotation, shift, cloud, other, partner, step, spacing):
 
 
 def resistance(rotation, shift, source, reference, there, step, spacing):
-    """The harmonic mean of the eigenvalues of the mean ``J^T n n^T J``, about the centroid."""
+    """The harmonic mean of the eigenvalues of the mean ``J^T n n^T J``, each a millionth larger."""
     points, normals = [], []
     for i, j in zip(range(0, len(source.points), step), there, strict=True):
         point = rotation @ source.points[i] + shift
@@ -65,7 +65,7 @@ def resistance(rotation, shift, source, reference, there, step, spacing):
     points, normals = np.array(points) - np.mean(points, axis=0), np.array(normals)
     points /= np.sqrt(np.mean(np.sum(points**2, axis=1)))
     rows = np.hstack([np.cross(points, normals), normals])
-    return 6 / np.sum(1 / np.linalg.eigvalsh(rows.T @ rows / len(rows)))
+    return 6 / np.sum(1 / (np.linalg.eigvalsh(rows.T @ rows / len(rows)) + 1e-6)) - 1e-6
 
 
 def by_loops(pose, source, reference, there, back, step=1) -> Evidence:
@@ -98,7 +98,7 @@ def by_loops(pose, source, reference, there, back, step=1) -> Evidence:
 @pytest.mark.parametrize("step", [1, 2, 3])
 def test_arbitrary_clouds_against_loops(rng, step):
     """Nothing agrees with anything, so that every term is seen; each cloud is the coarser once."""
-    for spacings in ((0.02, 0.03), (0.04, 0.01)):
+    for spacings in ((0.03, 0.04), (0.045, 0.02)):
         source, reference = (
             arbitrary(rng, n, s) for n, s in zip((150, 130), spacings, strict=True)
         )
@@ -107,7 +107,7 @@ def test_arbitrary_clouds_against_loops(rng, step):
         expected = by_loops(pose, source, reference, *pairs, step)
         assert 0 < expected.smaller < expected.larger < 1
         assert min(expected) > 0
-        assert_same(read(pose, source, reference, *pairs, step=step), expected, tolerance=1e-4)
+        assert_same(read(pose, source, reference, *pairs, step=step), expected, tolerance=1e-6)
 
 
 def test_without_a_near_point_only_the_priors_are_left(rng):

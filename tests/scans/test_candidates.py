@@ -35,7 +35,7 @@ def problem_of(source, reference):
 @pytest.mark.parametrize("count", [1, 5])
 def test_the_trees_of_the_host_show_the_same_as_all_distances(rng, count):
     """One definition: the poses of `register` are read as those of the search."""
-    clouds = problem_of(shape(rng, 520), 7 * shape(rng, 400) + 3).clouds()
+    clouds = problem_of(shape(rng, 520), shape(rng, 400) + 3).clouds()
     poses = [random_pose(rng, angle=0.3, shift=0.1) for _ in range(count)]
     found, score = clouds.judge(stacked(poses))
     assert score.shape == found.held.shape == (count,)
