@@ -18,19 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural.shapes import sample_shape
 from jaxreg.geometry import frame, rigid
+from jaxreg.judge.odds import probabilities
 from jaxreg.search import SearchConfig, describe, register_global, search_described
 from jaxreg.search.candidates import select_candidates
 from jaxreg.search.compatibility import compatibility
 from jaxreg.search.description import compare
 from jaxreg.search.hypotheses import pose_hypotheses, screen
 from jaxreg.search.pipeline import enter
-from jaxreg.search.ranking import (
-    PENALTY_GAP,
-    PENALTY_INTERIOR,
-    WEIGHT_DESCRIPTOR,
-    score_terms,
-    sparsity_factor,
-)
 from jaxreg.types import RigidTransform
 from jaxreg.view import pictures
 
@@ -41,6 +35,7 @@ DRAWN = 4  # Every fourth wrong candidate: all of them would hide the clouds.
 RIGHT_WITHIN = (
     0.1  # A candidate whose points lie so near each other is right, in units of the search.
 )
+SAME_DEG, SAME = 6.0, 0.1  # Poses nearer than this are one, and share no probability.
 CONFIG = SearchConfig()
 
 
@@ -55,8 +50,8 @@ class Stages(NamedTuple):
     angle_deg: np.ndarray
     overlap: np.ndarray
     best_angle_deg: np.ndarray
-    terms: np.ndarray
     score: np.ndarray
+    probability: np.ndarray
     found: RigidTransform
     found_angle_deg: np.ndarray
 
@@ -85,25 +80,24 @@ def run_stages() -> Stages:
     poses = pose_hypotheses(x[i], y[j], agree, seeds=CONFIG.seeds)
     found = search_described(*described)
     refined = RigidTransform(*register_global(x, y)[:2])
-    sparsity = sparsity_factor(*(cloud.spacing for cloud in described))
-    terms = jax.vmap(lambda pose: score_terms(pose, a, b, sparsity=sparsity))(found.poses)
     values = Stages(
         x, y, truth, jnp.stack([i, j], axis=1), apart < RIGHT_WITHIN,
         _angles_deg(poses, truth), screen(poses, a, b, described[1].grid),
-        _angles_deg(found.poses, truth), jnp.stack(terms, axis=1), found.score,
+        _angles_deg(found.poses, truth), found.score,
+        probabilities(found.score, distinct(found.poses)),
         refined, _angles_deg(jax.tree.map(lambda leaf: leaf[None], refined), truth)[0],
     )  # fmt: skip
     return jax.tree.map(np.asarray, values)
 
 
 def draw_search(path: Path) -> None:
-    """Four panels: candidates, poses, ranking, result."""
+    """Four panels: candidates, poses, what the judge says of the best of them, result."""
     stages = run_stages()
     figure = Figure(figsize=(11.5, 8.6), layout="constrained")
     grid = figure.subplots(2, 2, width_ratios=(1.25, 1), height_ratios=(1.05, 1))
     _draw_candidates(grid[0, 0], stages)
     _draw_poses(grid[0, 1], stages)
-    _draw_ranking(grid[1, 1], stages)
+    _draw_judged(grid[1, 1], stages)
     _draw_result(grid[1, 0], stages)
     figure.savefig(path, dpi=110, facecolor="white")
 
@@ -134,31 +128,24 @@ def _draw_poses(axes: Axes, stages: Stages) -> None:
     axes.set_title(f"3, 4, 5   {len(near)} poses, {near.sum()} within 15 degrees (green)")
 
 
-def _draw_ranking(axes: Axes, stages: Stages) -> None:
-    match, descriptor, interior, gap, _ = stages.terms.T
-    rows = np.arange(len(match))
-    parts = (
-        ("match", match, RIGHT),
-        ("0.33 descriptor", WEIGHT_DESCRIPTOR * descriptor, "#8fd0aa"),
-        ("1.8 interior", -PENALTY_INTERIOR * interior, "#e89a3c"),
-        ("4.1 gap", -PENALTY_GAP * gap, WRONG),
-    )
-    above, below = np.zeros(len(rows)), np.zeros(len(rows))
-    for label, value, color in parts:
-        start = np.where(value > 0, above, below)
-        axes.barh(rows, value, left=start, color=color, label=label, height=0.7)
-        above, below = above + np.maximum(value, 0), below + np.minimum(value, 0)
-    axes.plot(stages.score, rows, "D", color="black", ms=5, label="score")
+def _draw_judged(axes: Axes, stages: Stages) -> None:
+    rows, near = np.arange(len(stages.score)), stages.best_angle_deg < 15
+    axes.barh(rows, stages.score, color=np.where(near, RIGHT, WRONG), height=0.7)
+    for row, score, chance in zip(rows, stages.score, stages.probability, strict=True):
+        text = f"{chance:.2f}" if chance else "same as a better one"
+        place = (
+            {"ha": "left", "xytext": (5, 0)} if score >= 0 else {"ha": "right", "xytext": (-5, 0)}
+        )
+        axes.annotate(text, (score, row), va="center", textcoords="offset points", **place)
     axes.axvline(0, color="black", lw=0.8)
+    axes.margins(x=0.2)
     axes.set_yticks(rows, [f"{angle:.0f}°" for angle in stages.best_angle_deg])
-    axes.set(ylabel="away from the true pose", xlabel="for and against, in shares of the points")
+    axes.set(
+        ylabel="away from the true pose", xlabel="log odds, and the probability beside the bar"
+    )
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(
-        frameon=False, loc="upper center", bbox_to_anchor=(0.45, -0.16), ncols=5, fontsize=9,
-        handlelength=1, columnspacing=1.2,
-    )  # fmt: skip
-    axes.set_title(f"6, 7   the best {len(rows)}, aligned and ranked")
+    axes.set_title(f"6, 7   the best {len(rows)}, aligned and judged (right: green)")
 
 
 def _draw_result(axes: Axes, stages: Stages) -> None:
@@ -172,6 +159,17 @@ def _draw_result(axes: Axes, stages: Stages) -> None:
     axes.set_title(
         f"8   the best one, refined: {stages.found_angle_deg:.1f} degrees from the truth"
     )
+
+
+def distinct(poses: RigidTransform) -> np.ndarray:
+    """Whether no earlier pose is the same but for noise."""
+    matrices, shifts = (np.asarray(part) for part in poses)
+    counted = np.ones(len(matrices), bool)
+    for k in range(1, len(matrices)):
+        turned = rigid.rotation_angle_deg(matrices[:k], matrices[k][None])
+        moved = np.linalg.norm(shifts[:k] - shifts[k], axis=1)
+        counted[k] = not np.any(counted[:k] & (turned < SAME_DEG) & (moved < SAME))
+    return counted
 
 
 def _angles_deg(poses: RigidTransform, truth: RigidTransform) -> jax.Array:
