@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.judge.surface import Examined, every
 from jaxreg.types import RigidTransform
 
@@ -41,13 +42,14 @@ class Evidence(NamedTuple):
     the plane of their partner, in spacings, and `rough_distance` that of points whose surface is
     rough, there or at the partner; `rough_facing` is the mean cosine of the two normals there.
     `disagreement` is the share of near points that lie off the plane or face another way, the more
-    heavily weighed the rarer their direction is in their cloud (a wall agrees with every wall).
+    heavily weighed the rarer their direction is in their cloud (a wall agrees with every wall);
+    points without a normal, and those whose partner has none, do not count for it.
     Per near point, `beside` is the number of points that lie just off the other cloud, and `unseen`
     that of those just off its *interior*: if a scan does not end there, it should have seen these
     points, too. `rough` is the share of near points that are rough, `ends` the share whose partner
     lies where its surface ends. `held` is how strongly the
-    near surfaces resist the motion that they resist least; 1/3 for surfaces that face all
-    directions, 0 for a plane.
+    near surfaces resist the motion that they resist least; 4/15 for surfaces that face all
+    directions everywhere, 0 for a plane.
     """
 
     smaller: Float[Any, "*k"]
@@ -80,7 +82,8 @@ def read_evidence(
     """
     turned = pose.rotation.T
     moved = source._replace(
-        points=jnp.matmul(source.points, turned, precision=Precision.HIGHEST) + pose.translation,
+        points=jnp.matmul(source.points, turned, precision=Precision.HIGHEST)
+        + pose.translation[None, :],
         normals=jnp.matmul(source.normals, turned, precision=Precision.HIGHEST),
     )
     spacing = jnp.maximum(source.spacing, reference.spacing)
@@ -89,7 +92,8 @@ def read_evidence(
     other = _one_way(fewer, moved, back, spacing)
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
     near, rough = both.near, both.near & both.rough
-    shares = [_share(side.near, cloud.mask) for side, cloud in ((one, few), (other, fewer))]
+    shares = [_share(side, cloud.mask) for side, cloud in ((one, few), (other, fewer))]
+    seen = _count(near, both.across)
     off = (both.across > _APART) | (both.cosine < _ACROSS)
     return Evidence(
         smaller=jnp.minimum(*shares),
@@ -98,10 +102,10 @@ def read_evidence(
         rough_distance=_mean(both.across, rough, prior=1.0),
         rough_facing=_mean(both.cosine, rough, prior=0.5),
         disagreement=_sum(both.rarity, near & off) / (_sum(both.rarity, near) + _MORE),
-        beside=jnp.sum(both.beside) / (jnp.sum(near) + _MORE),
-        unseen=jnp.sum(both.unseen) / (jnp.sum(near) + _MORE),
-        rough=jnp.sum(rough) / (jnp.sum(near) + _FEW),
-        ends=_sum(both.ends, near) / (jnp.sum(near) + _MORE),
+        beside=_count(both.beside, both.across) / (seen + _MORE),
+        unseen=jnp.sum(both.unseen) / (seen + _MORE),
+        rough=_count(rough, both.across) / (seen + _FEW),
+        ends=_sum(both.ends, near) / (seen + _MORE),
         held=_held(few.points, reference.normals[there], one.near),
     )
 
@@ -133,8 +137,13 @@ def _one_way(moved: Examined, other: Examined, partner: Int[Array, "n"], spacing
         rough=jnp.maximum(moved.variation, other.variation[partner]) > ROUGH,
         across=jnp.minimum(across, NEAR),
         cosine=jnp.abs(jnp.sum(moved.normals * normal, axis=1)),
-        rarity=moved.rarity,
+        # Where no normal is known, nothing faces another way.
+        rarity=jnp.where(_known(moved.normals) & _known(normal), moved.rarity, 0),
     )
+
+
+def _known(normals: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+    return jnp.any(normals != 0, axis=1)
 
 
 def _sum(values: Array, chosen: Array) -> Array:
@@ -142,11 +151,15 @@ def _sum(values: Array, chosen: Array) -> Array:
 
 
 def _mean(values: Array, chosen: Array, *, prior: float) -> Array:
-    return (_sum(values, chosen) + prior * _FEW) / (jnp.sum(chosen) + _FEW)
+    return (_sum(values, chosen) + prior * _FEW) / (_count(chosen, values) + _FEW)
 
 
-def _share(chosen: Array, mask: Array) -> Array:
-    return jnp.sum(chosen) / jnp.maximum(jnp.sum(mask), 1)
+def _share(side: _Side, mask: Array) -> Array:
+    return _count(side.near, side.across) / jnp.maximum(_count(mask, side.across), 1)
+
+
+def _count(chosen: Array, like: Array) -> Array:
+    return jnp.sum(chosen, dtype=like.dtype)
 
 
 def _held(
@@ -159,8 +172,9 @@ def _held(
     """
     weight = near.astype(points.dtype)
     count = jnp.maximum(jnp.sum(weight), 1)
-    centred = (points - jnp.sum(weight[:, None] * points, axis=0) / count) * weight[:, None]
-    radius = jnp.sqrt(jnp.sum(centred**2) / count) + 1e-12
+    centre = jnp.sum(weight[:, None] * points, axis=0) / count
+    centred = (points - centre[None, :]) * weight[:, None]
+    radius = safe_sqrt(jnp.sum(centred**2) / count) + 1e-12
     rows = jnp.concatenate([jnp.cross(centred / radius, normals), normals], axis=1)
     rows = rows * weight[:, None]
     mean = jnp.matmul(rows.T, rows, precision=Precision.HIGHEST) / count

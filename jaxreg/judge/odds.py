@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg.judge.evidence import Evidence
 
-INTERCEPT = 4.418
+INTERCEPT = 3.883
 WEIGHTS = Evidence(
-    smaller=4.344, larger=-0.818, distance=-2.948, rough_distance=-2.833, rough_facing=-5.063,
-    disagreement=-15.074, beside=4.738, unseen=-27.314, rough=4.019, ends=18.089, held=4.438,
+    smaller=2.75, larger=-0.99, distance=-6.861, rough_distance=-2.954, rough_facing=-6.927,
+    disagreement=-11.009, beside=7.476, unseen=-12.954, rough=0.537, ends=10.748, held=5.685,
 )  # fmt: skip
 """What one unit of every feature adds to the log odds."""
 

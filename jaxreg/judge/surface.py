@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.geometry.neighbors import without_padding
 from jaxreg.geometry.normals import edge_normals, neighborhood_covariances
-from jaxreg.geometry.numerics import safe_norm
+from jaxreg.geometry.numerics import safe_norm, safe_sqrt
 
 NEIGHBORS = 16
 """Neighbours of the neighbourhood whose roughness counts."""
@@ -46,6 +47,7 @@ def examine(
 ) -> Examined:
     """`Examined` of a cloud; `neighbors`, usually NEIGHBORS, are rows of it, the nearest first."""
     mask = jnp.ones(len(points), bool) if mask is None else mask
+    points, normals = without_padding(points, mask), without_padding(normals, mask)
     covariance = neighborhood_covariances(points, neighbors, mask)
     # The normal is the direction of the smallest eigenvalue, so that none is computed again.
     least = jnp.einsum("ni,nij,nj->n", normals, covariance, normals, precision=Precision.HIGHEST)
@@ -72,14 +74,15 @@ def _fourth_spacing(
     """
     fourth = neighbors[:, min(3, neighbors.shape[1] - 1)]
     squared = jnp.sum((points - points[fourth]) ** 2, axis=1)
-    return jnp.sqrt(jnp.nanmedian(jnp.where(mask, squared, jnp.nan)))
+    median = jnp.nanmedian(jnp.where(mask, squared, jnp.nan))
+    return safe_sqrt(jnp.where(jnp.any(mask), median, 0))
 
 
 def _share_alike(normals: Float[Array, "n 3"], mask: Bool[Array, "n"]) -> Float[Array, "n"]:
-    count = jnp.maximum(jnp.sum(mask), 1)
+    count = jnp.maximum(jnp.sum(mask, dtype=normals.dtype), 1)
 
     def row(normal: Float[Array, "3"]) -> Float[Array, ""]:
         cosine = jnp.abs(jnp.matmul(normals, normal, precision=Precision.HIGHEST))
-        return jnp.sum(mask & (cosine > _ALIKE)) / count
+        return jnp.sum(mask & (cosine > _ALIKE), dtype=normals.dtype) / count
 
     return jax.lax.map(row, normals, batch_size=_ROWS)

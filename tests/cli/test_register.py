@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg import io
 from jaxreg.cli import main, process
 from jaxreg.cli.options import BAD_INPUT, NOT_TRUSTED, SUCCESS
+from jaxreg.judge.evidence import Evidence
 
 pytestmark = pytest.mark.float32
 
@@ -59,7 +60,8 @@ def test_json_is_strict_and_complete(registered):
     assert found["success"] is True
     assert found["source"].endswith("a.ply")
     assert np.shape(found["covariance"]) == (6, 6)
-    assert found["evidence"]["overlap"] == found["overlap"]
+    assert set(found["evidence"]) == set(Evidence._fields)
+    assert 0 < found["evidence"]["smaller"] <= found["evidence"]["larger"] <= 1
     assert 0 <= found["mean_confidence"] <= 1
     assert "correspondences" not in found
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg.data.procedural import shapes
 from jaxreg.refine import kdtree
 from jaxreg.refine.config import RefineConfig
-from jaxreg.scans import prepare, verdict
+from jaxreg.scans import prepare
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
@@ -84,6 +84,9 @@ def test_record(pair, result):
     assert np.all(np.linalg.eigvalsh(result.covariance) >= 0)
     assert result.weak_directions == ()
     assert result.dropped == 0
+    assert result.success == (result.probability >= 0.5) == (result.reason == "")
+    assert 0 <= result.probability + sum(o.probability for o in result.alternatives) <= 1 + 1e-9
+    assert 0 < result.evidence.smaller <= result.evidence.larger <= 1
 
 
 def test_identical_clouds_stay(pair):
@@ -242,7 +245,8 @@ def test_given_pose_skips_the_search(pair):
     kept = register(source, reference, initial=RigidTransform(near, shift), config=UNREFINED)
     np.testing.assert_allclose(kept.rotation, near, atol=1e-14)
     np.testing.assert_allclose(kept.translation, shift, atol=1e-14)
-    assert np.isnan(found.evidence.rival)
+    assert found.alternatives == ()
+    assert np.isfinite(found.evidence).all()
     assert np.isfinite(found.covariance).all()
     assert np.isnan(kept.covariance).all()  # zero would say that the pose is known for sure
 
@@ -266,7 +270,8 @@ def test_limited_rotation_is_kept(pair):
     found = register(*pair[:2], max_rotation_deg=80)
     # The right pose turns by 160 degrees; a refinement may turn on, but hardly.
     assert angle_deg(found.rotation, np.eye(3)) < 80.5
-    assert found.evidence.rival <= verdict.NO_RIVAL  # and no pose beyond counts as a rival
+    for other in found.alternatives:  # and no pose beyond counts as a rival
+        assert angle_deg(other.transform.rotation, np.eye(3)) < 80.5
 
 
 def test_limited_rotation_is_kept_where_all_rotations_fit(seed):
@@ -478,4 +483,8 @@ def test_a_wrong_pose_says_why_and_names_the_others(pair):
     found = register(*box)
     turns = [angle_deg(other.transform.rotation, found.rotation) for other in found.alternatives]
     assert sum(turn > 175 for turn in turns) >= 2  # half turns about its axes
-    assert min(other.lead for other in found.alternatives) < 0.1
+    chances = [other.probability for other in found.alternatives]
+    assert chances == sorted(chances, reverse=True)
+    assert sum(chances) > 0.5  # three of the four poses that agree equally well
+    assert found.probability + sum(chances) <= 1 + 1e-9
+    assert not found.success

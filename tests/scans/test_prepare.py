@@ -87,6 +87,18 @@ def test_clouds_of_unlike_density_are_thinned_to_one(rng):
         assert prepare.at_one_density(*clouds)[0] is levels[0]  # made once
 
 
+def test_a_level_is_examined_once_and_its_padding_does_not_count(rng):
+    plane = rng.uniform(-1, 1, size=(300, 3)) * [5, 3, 0]
+    level = prepare.prepare(plane).fine
+    found = level.examined
+    assert level.examined is found
+    np.testing.assert_array_equal(found.mask, np.arange(512) < 300)
+    # The unit of the level, in which the spacing of the same points is that of the trees.
+    assert float(found.spacing) == pytest.approx(level.spacing, rel=0.01)
+    np.testing.assert_allclose(found.rarity[:300], 1, rtol=1e-6)
+    assert np.max(found.variation[:300]) < 1e-6
+
+
 def test_normals_that_are_given_are_used_and_found_ones_are_not(rng):
     plane = rng.uniform(-1, 1, size=(300, 3)) * [1, 1, 0]
     given = np.tile([0.0, 3.0, 4.0], (300, 1))

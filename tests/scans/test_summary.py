@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import summary
-from jaxreg.scans.pair import ScanRegistration
-from jaxreg.scans.verdict import Evidence
+from jaxreg.scans.pair import Alternative, ScanRegistration
+from jaxreg.types import RigidTransform
 
 SLIDE = WeakDirection("translation", np.array([1.0, 0, 0]), np.zeros(3), 1e-4)
 TURN = WeakDirection("rotation", np.array([0.0, 0, 1]), np.zeros(3), 2e-4)
+
+EVIDENCE = Evidence(0.5, 0.6, np.inf, 0.7, 0.8, 0.1, 0.2, 0.05, 0.3, 0.15, 0.02)
 
 
 @pytest.fixture
@@ -27,7 +30,7 @@ def result(seed):
         confidence=np.array([0.0, 1.0, 0.5]),
         correspondences=np.full((3, 3), np.nan),
         max_correspondence_distance=0.1,
-        reason="" if False else "Only 60% of the points lie near the other cloud.",
+        reason="Only 60% of the points lie near the other cloud.",
         alternatives=(),
         converged=True,
         fitness=0.8,
@@ -37,7 +40,7 @@ def result(seed):
         weak_directions=(SLIDE, TURN),
         success=False,
         probability=0.25,
-        evidence=Evidence(0.6, 0.5, np.inf, 0.0, 0.3, 0.2),
+        evidence=EVIDENCE,
         dropped=2,
     )
 
@@ -71,12 +74,25 @@ def test_nothing_is_claimed_without_a_refinement(result):
     assert (exact["one sigma"], exact["weak directions"]) == ("0 deg, 0", "none")
 
 
+def test_other_poses_are_named_where_they_may_be_right(result):
+    assert summary.figures(result)["alternatives"] == "none that may be right"
+    turns = [Rotation.from_rotvec(np.radians([0, 0, angle])) for angle in (180, 90, 20)]
+    alternatives = tuple(
+        Alternative(RigidTransform(turn.as_matrix() @ result.rotation, np.zeros(3)), chance)
+        for turn, chance in zip(turns, (0.4, 0.125, 0.01), strict=True)
+    )
+    found = dataclasses.replace(result, alternatives=alternatives)
+    told = summary.figures(found)["alternatives"]
+    assert told == "0.40 turned by 180 deg; 0.12 turned by 90 deg"
+    listed = summary.record(found)["alternatives"]
+    assert [other["probability"] for other in listed] == [0.4, 0.125, 0.01]
+    assert listed[0]["transform"]["rotation"] == alternatives[0].transform.rotation.tolist()
+
+
 def test_record_is_json_and_reads_back(result):
     text = json.dumps(summary.record(result), allow_nan=False)
     read = json.loads(text)
-    assert read["evidence"] == {
-        "overlap": 0.6, "smaller": 0.5, "gap": None, "facing": 0.0, "constraint": 0.3, "rival": 0.2,
-    }  # fmt: skip
+    assert read["evidence"] == EVIDENCE._asdict() | {"distance": None}
     np.testing.assert_array_equal(read["rotation"], result.rotation)
     assert [found["name"] for found in read["weak_directions"]] == [SLIDE.name, TURN.name]
     assert read["weak_directions"][1]["axis"] == [0, 0, 1]

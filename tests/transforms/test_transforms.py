@@ -19,6 +19,7 @@ import pytest
 import jaxreg
 from tests.compiled import AS_USERS
 from tests.transforms.core_rows import core_rows
+from tests.transforms.judge_rows import judge_rows
 from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.refine_rows import refine_rows
 from tests.transforms.rows import Row
@@ -75,6 +76,9 @@ ROOMS = (
     "refine.point_to_plane",
     "refine.uncertainty",
     "refine.robust",
+    "judge.evidence",
+    "judge.odds",
+    "judge.surface",
     "search.alignment",
     "search.candidates",
     "search.compatibility",
@@ -84,12 +88,11 @@ ROOMS = (
     "search.learned",
     "search.nearest",
     "search.pipeline",
-    "search.ranking",
     "search.stages",
     "search.surface",
 )
 
-TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows()
+TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows() | judge_rows()
 
 
 def public_functions() -> set[str]:

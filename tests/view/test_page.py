@@ -10,9 +10,9 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
+from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans.pair import ScanRegistration
-from jaxreg.scans.verdict import Evidence
 from jaxreg.view import page
 
 POSE = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
@@ -37,7 +37,7 @@ def registration(source, reference, *, rotation=POSE, translation=(0.0, 0, 0), s
         weak_directions=(WeakDirection("rotation", np.array([0.0, 0, 1]), np.zeros(3), 1e-4),),
         success=success,
         probability=0.97 if success else 0.03,
-        evidence=Evidence(0.5, 0.5, 1.0, 0.0, 0.3, 0.2),
+        evidence=Evidence(*np.linspace(0.1, 0.9, len(Evidence._fields))),
         dropped=0,
     )
 
