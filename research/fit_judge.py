@@ -33,6 +33,13 @@ from research.judge_pairs import KINDS, made_pairs
 _PENALTY = 1.0
 _ALIKE = ("redkitchen", "redkitchen_lomatch", "redkitchen_frames")
 """Sets of one sensor and one room: they are left out together."""
+_MORE, _LESS, _ANY = (0, None), (None, 0), (None, None)
+_SIGN = {
+    "smaller": _MORE, "larger": _ANY, "distance": _LESS, "rough_distance": _LESS,
+    "rough_facing": _MORE, "disagreement": _LESS, "beside": _ANY, "unseen": _LESS, "rough": _MORE,
+    "ends": _ANY, "held": _MORE,
+}  # fmt: skip
+"""Whether evidence may speak for a pose or against it: few sensors must not turn that around."""
 _WEIGHT = {"ends": 0.2, "unrelated": 0.5, "crops": 2.0}
 """Weight of a pair, 1 for the others: the ends of many shapes are congruent, and no evidence tells
 that they are two; crops stand for all pairs of `register_global`."""
@@ -142,7 +149,9 @@ def fitted(entries: list[dict]) -> np.ndarray:
             slope += np.append(change.sum(), x.T @ change)
         return total, slope
 
-    found = minimize(loss, np.zeros(every.shape[1] + 1), jac=True, method="L-BFGS-B").x
+    bounds = [(None, None), *(_SIGN[name] for name in Evidence._fields)]
+    start = np.zeros(every.shape[1] + 1)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[1:] / spread
     return np.append(found[0] - weights @ middle, weights)
 

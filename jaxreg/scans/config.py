@@ -12,7 +12,9 @@ class RegisterConfig:
 
     search: SearchConfig = SearchConfig()
     """The search for a pose, used if no start is given."""
-    wide: SearchConfig | None = SearchConfig(candidates=1024, seeds=1024, screened=512, aligned=32)
+    wide: SearchConfig | None = SearchConfig(
+        candidates=1024, seeds=1024, screened=512, aligned=32, judged=True
+    )
     """A second search, with learned features, if the first leaves doubts; None: there is none."""
     refine: RefineConfig | None = RefineConfig(
         iterations=10,

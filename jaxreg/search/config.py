@@ -32,6 +32,10 @@ class SearchConfig:
     """Distinct poses that are aligned coarsely, those with the largest overlap first."""
     aligned: int = 8
     """Distinct poses that are aligned with exact neighbours and ranked."""
+    judged: bool = False
+    """Rank poses by the judge (`jaxreg.judge`) in place of the score of `jaxreg.search.ranking`. It
+    finds more pairs of low overlap among many poses; of clouds of 1024 points with noise or crops it
+    loses a few pairs of a hundred."""
     final: RefineConfig = RefineConfig(
         iterations=15,
         max_correspondence_distance=0.06,

@@ -17,16 +17,13 @@ from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import check_cloud, describe
 from jaxreg.search.learned import Network
 from jaxreg.search.nearest import nearest_packed
+from jaxreg.search.ranking import NEAR_WIDTH, sparsity_factor
 from jaxreg.search.stages import Search, check_transform, search_described
 from jaxreg.types import GlobalRegistration, RigidTransform
 
 _DEFAULT = SearchConfig()
 _RMS_OF_UNIT_SPHERE = 0.5
 """Root mean square radius of a usual shape that touches the unit sphere (ModelNet40: 0.4 to 0.6)."""
-NEAR_WIDTH = 0.05
-"""Gaussian width of the distance at which a point of the result is trusted, in units of the search."""
-_DENSE_SPACING = 0.035
-"""Mean distance to the nearest point, in units of the search, up to which a cloud counts as dense."""
 
 
 def register_global(
@@ -52,7 +49,7 @@ def register_global(
 
     `max_angle` (radians) bounds the rotation, which decides between the poses of a symmetric shape;
     if the search finds no pose within it, the best of all is returned. `score` is
-    the log odds of the pose before the last refinement (`jaxreg.judge`).
+    that of `ranking`, of the pose before the last refinement.
 
     Raises:
       ValueError: a cloud is not (n, 3) of floats or has fewer than four rows, a mask or the similarity
@@ -66,9 +63,7 @@ def register_global(
     found = search_described(
         *described, network=network, similarity=similarity, max_angle=max_angle, config=config
     )
-    spacing = jnp.maximum(described[0].spacing, described[1].spacing)
-    # How much farther apart than in dense clouds the points of matching surfaces lie.
-    sparsity = jnp.maximum(spacing / _DENSE_SPACING, 1)
+    sparsity = sparsity_factor(described[0].spacing, described[1].spacing)
     start = jax.tree.map(lambda leaf: leaf[0], found.poses)
     pose = _refined((x, y), (source_mask, reference_mask), start, sparsity, config.final)
     masks = described[0].mask, described[1].mask

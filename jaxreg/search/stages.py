@@ -30,6 +30,13 @@ from jaxreg.search.hypotheses import (
 )
 from jaxreg.search.learned import Network
 from jaxreg.search.nearest import NearestGrid, lookup, nearest_packed
+from jaxreg.search.ranking import (
+    break_ties,
+    score_of,
+    score_terms,
+    score_terms_by_grid,
+    sparsity_factor,
+)
 from jaxreg.search.surface import Surface, thinned
 from jaxreg.types import RigidTransform
 
@@ -43,7 +50,9 @@ _ALIGNED_APART = Separation(angle=0.1, distance=0.05)
 
 
 class Search(NamedTuple):
-    """The aligned poses (leading axis), the best first, with their scores: log odds (`jaxreg.judge`).
+    """The aligned poses (leading axis), the best first, with their scores.
+
+    These are of `ranking`, or log odds (`jaxreg.judge`) if the search is `judged`.
 
     Poses that turn by more than the search permits are not `allowed`, and come last.
     """
@@ -60,6 +69,7 @@ class _Problem(NamedTuple):
     reference: Surface
     grids: tuple[NearestGrid, NearestGrid]
     examined: tuple[Examined, Examined]
+    sparsity: Float[Array, ""]
     max_angle: Float[Array, ""] | float
 
 
@@ -90,11 +100,12 @@ def search_described(
         compared.reference,
         (source.grid, reference.grid),
         (source.examined, reference.examined),
+        sparsity_factor(source.spacing, reference.spacing),
         max_angle,
     )
     poses = _screened(_hypotheses(compared, config), also, problem, config)
     poses = _shortlisted(_coarsely_aligned(poses, problem), problem, config)
-    return _ranked(_finely_aligned(poses, problem), problem)
+    return _ranked(_finely_aligned(poses, problem), problem, config)
 
 
 def _check_search(source: Described, reference: Described, similarity, also, max_angle) -> None:
@@ -152,7 +163,7 @@ def _screened(
     """The distinct best hypotheses by their overlap in both directions, `also` the first of them."""
     if also is not None:
         poses = jax.tree.map(lambda one, all: jnp.concatenate([one[None], all]), also, poses)
-    source, reference, grids, _, max_angle = problem
+    source, reference, grids, *_, max_angle = problem
     score = screen(poses, thinned(source, _COARSE_STEP), reference, grids[1])
     back = jax.vmap(rigid.inverse)(poses)
     score = score + screen(back, thinned(reference, _COARSE_STEP), source, grids[0])
@@ -173,10 +184,15 @@ def _coarsely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransfor
 
 def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> RigidTransform:
     """The distinct poses that score best at a glance: the fine alignment is what takes time."""
-    grids, (source, reference), max_angle = problem[2:]
+    grids, (source, reference), sparsity, max_angle = problem[2:]
     few, fewer = (cloud.points[::_COARSE_STEP] for cloud in (source, reference))
 
     def at_a_glance(pose: RigidTransform):
+        if not config.judged:
+            terms = score_terms_by_grid(
+                pose, problem.source, problem.reference, grids, step=_COARSE_STEP, sparsity=sparsity
+            )
+            return score_of(terms)
         there = lookup(grids[1], rigid.apply(pose, few))
         back = lookup(grids[0], rigid.apply(rigid.inverse(pose), fewer))
         return log_odds(read_evidence(pose, source, reference, there, back, step=_COARSE_STEP))
@@ -191,8 +207,29 @@ def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
     return jax.lax.map(lambda pose: align_fine(pose, few, fewer), poses)
 
 
-def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
+def _ranked(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> Search:
     """The poses, the allowed ones first, then by what speaks for them."""
+    # Again, because alignment may have turned a pose out of the bounds of the search.
+    allowed = _turns_less(poses, problem.max_angle)
+    score = _judged(poses, problem) if config.judged else _scored(poses, problem, allowed)
+    order = jnp.lexsort((-score, ~allowed))
+    return Search(best_of(poses, order), score[order], allowed[order])
+
+
+def _scored(
+    poses: RigidTransform, problem: _Problem, allowed: Bool[Array, "s"]
+) -> Float[Array, "s"]:
+    """The scores of `ranking`, with ties broken."""
+
+    def terms_of(pose: RigidTransform):
+        return score_terms(pose, problem.source, problem.reference, sparsity=problem.sparsity)
+
+    terms = jax.lax.map(terms_of, poses)
+    return break_ties(score_of(terms), terms.plane, allowed)
+
+
+def _judged(poses: RigidTransform, problem: _Problem) -> Float[Array, "s"]:
+    """The log odds of `jaxreg.judge`."""
     source, reference = problem.examined
 
     def judged(pose: RigidTransform):
@@ -201,11 +238,7 @@ def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
         back = nearest_packed(reference.points, moved, source.mask)
         return log_odds(read_evidence(pose, source, reference, there, back))
 
-    score = jax.lax.map(judged, poses)
-    # Again, because alignment may have turned a pose out of the bounds of the search.
-    allowed = _turns_less(poses, problem.max_angle)
-    order = jnp.lexsort((-score, ~allowed))
-    return Search(best_of(poses, order), score[order], allowed[order])
+    return jax.lax.map(judged, poses)
 
 
 def _turns_less(poses: RigidTransform, angle: Array | float) -> Bool[Array, "s"]:

@@ -18,6 +18,7 @@ from jaxreg.search import (
     learned,
     nearest,
     pipeline,
+    ranking,
     stages,
     surface,
 )
@@ -62,6 +63,11 @@ def of_cloud(function):
         return function(cloud, normals, squared_distances(cloud, cloud), mask)
 
     return described
+
+
+def by_grids(pose, source, reference):
+    grids = grid_of(source.points), grid_of(reference.points)
+    return ranking.score_terms_by_grid(pose, source, reference, grids, step=2)
 
 
 def described(cloud, mask):
@@ -149,6 +155,25 @@ def parts() -> dict[str, Row]:
             (*every(lambda x: (x, ALL)), (x, NONE)),
         ),
         "nearest.lookup": Row(in_grid, (x, y), every(lambda x: (x, x)), smooth=False),
+        "ranking.sparsity_factor": Row(
+            ranking.sparsity_factor, (np.float64(0.1), np.float64(0.2)), ((*np.zeros((2,)),),)
+        ),
+        "ranking.score_terms": Row(
+            functools.partial(ranking.score_terms, sparsity=20.0),
+            (pose(), moved, surface_of(y)),
+            (*same, (pose(), moved._replace(mask=NONE), moved)),
+        ),
+        "ranking.score_terms_by_grid": Row(by_grids, (pose(), moved, surface_of(y)), same),
+        "ranking.move": Row(ranking.move, (pose(), moved)),
+        "ranking.score_of": Row(ranking.score_of, (ranking.ScoreTerms(*RNG.uniform(size=(5, 3))),)),
+        "ranking.break_ties": Row(
+            ranking.break_ties,
+            (np.array([0.3, 0.31, 0.1]), np.array([0.2, 0.1, 0.3]), np.ones(3, bool)),
+            (
+                (np.zeros(3), np.zeros(3), np.ones(3, bool)),
+                (np.zeros(3), np.ones(3), ALL[:3] & False),
+            ),
+        ),
         "surface.thinned": Row(lambda s: surface.thinned(s, 2), (moved,)),
     }
 
