@@ -1,7 +1,5 @@
 """Rows of the judge: what a cloud shows, what a pose shows, and the odds of that."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +27,10 @@ def shown(*shape):
 
 
 def judge_rows() -> dict[str, Row]:
-    read = functools.partial(evidence.read_evidence, there=PARTNERS, back=PARTNERS)
+    def read(pose, source, reference):
+        there = back = jnp.asarray(PARTNERS)
+        return evidence.read_evidence(pose, source, reference, there, back)
+
     empty = (pose(), examined(points(), mask=NONE), examined(points()))
     nothing = jax.tree.map(np.zeros_like, shown(3))._replace(
         distance=np.full(3, 1.2), rough_distance=np.ones(3)

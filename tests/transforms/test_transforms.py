@@ -39,7 +39,12 @@ HOST |= {"search.learned.load_features", "search.learned.feature_config"}
 HOST |= {"search.learned.check_network", "search.description.check_cloud"}
 HOST |= {"search.stages.check_transform"}
 HOST |= {"search.learned.init_network"}
-HOST |= {"io.read_cloud", "io.write_cloud", "view.page.write_page", "view.pictures.plot_pair"}
+HOST |= {
+    "io.read_cloud",
+    "io.writing.write_cloud",
+    "view.page.write_page",
+    "view.pictures.plot_pair",
+}
 HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training.train"}
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
