@@ -93,6 +93,7 @@ ROOMS = (
     "search.learned",
     "search.nearest",
     "search.pipeline",
+    "search.ranking",
     "search.stages",
     "search.surface",
 )
