@@ -177,7 +177,8 @@ def scan_covariance(
     with ``g_k`` the sum of ``psi(r_i) J_i^T n_i`` over patch k, about _PATCH pairs, and
     ``B = E[psi'] sum_i J_i^T n_i n_i^T J_i``.
     """
-    scene = Scene(moved - centre, reference - centre, None, reference_normals, weighting)
+    moved, reference = moved - centre[None, :], reference - centre[None, :]
+    scene = Scene(moved, reference, None, reference_normals, weighting)
     pose = rigid.identity(moved.dtype)
     weighed = match(scene, pose, pairs, POINT_TO_PLANE)
     counts = weighed.counts
@@ -192,7 +193,7 @@ def scan_covariance(
     spread = jnp.sqrt(jnp.sum(jnp.where(counts[:, None], weighed.moved**2, 0)) / number)
     patch = _patches(weighed.moved, spread * jnp.sqrt(_PATCH * 12 / number))
     ones = counts.astype(moved.dtype)
-    filled = jnp.sum(jax.ops.segment_sum(ones, patch, _BINS) > 0)
+    filled = jnp.sum(jax.ops.segment_sum(ones, patch, _BINS) > 0).astype(moved.dtype)
     sums = jax.ops.segment_sum(slopes * ones[:, None], patch, _BINS)
     meat = jnp.matmul(sums.T, sums, precision="highest") * filled / jnp.maximum(filled - 6, 1)
     covariance = jnp.matmul(
@@ -206,7 +207,7 @@ def scan_covariance(
 def _patches(points: Float[Array, "n 3"], edge: Float[Array, ""]) -> Int[Array, "n"]:
     """A number for the cube of an `edge` that a point lies in; some cubes share one."""
     cell = jnp.floor(points / jnp.maximum(edge, 1e-12)).astype(jnp.int32)
-    mixed = cell * jnp.array([73856093, 19349663, 83492791], jnp.int32)
+    mixed = cell * jnp.array([[73856093, 19349663, 83492791]], jnp.int32)
     return (mixed[:, 0] ^ mixed[:, 1] ^ mixed[:, 2]) & (_BINS - 1)
 
 
