@@ -175,9 +175,13 @@ def scan_covariance(
         B^-1 (c / (c - 6) sum_k g_k g_k^T) B^-1 * _BOTH_NOISY,
 
     with ``g_k`` the sum of ``psi(r_i) J_i^T n_i`` over patch k, about _PATCH pairs, and
-    ``B = E[psi'] sum_i J_i^T n_i n_i^T J_i``.
+    ``B = E[psi'] sum_i J_i^T n_i n_i^T J_i``. A constant of every derivative.
     """
     moved, reference = moved - centre[None, :], reference - centre[None, :]
+    # A figure to read, not to descend on: which points share a patch is a discrete choice.
+    moved, reference, reference_normals = jax.lax.stop_gradient(
+        (moved, reference, reference_normals)
+    )
     scene = Scene(moved, reference, None, reference_normals, weighting)
     pose = rigid.identity(moved.dtype)
     weighed = match(scene, pose, pairs, POINT_TO_PLANE)

@@ -128,6 +128,12 @@ def small_parts() -> dict[str, Row]:
             (RNG.uniform(size=N), RNG.uniform(size=N), pairs(), np.float64(0.5)),
             ((np.zeros(N), np.zeros(N), none(pairs()), np.float64(0.5)),),
         ),
+        "refine.robust.pair_curvatures": Row(
+            lambda r, these: robust.pair_curvatures(r, these.mask, WIDE._replace(kernel_scale=0.5)),
+            (RNG.uniform(size=N), pairs()),
+            ((np.zeros(N), none(pairs())),),
+            smooth=False,
+        ),
         "refine.robust.counting_pairs": Row(
             lambda d, these: robust.counting_pairs(d, these.mask, WIDE._replace(trim=0.7)),
             (RNG.uniform(size=N), pairs()),
@@ -271,6 +277,14 @@ def steps_and_loops() -> dict[str, Row]:
             functools.partial(uncertainty.uncertainty_of_pairs, weighting=WIDE),
             (frames, x, y, tilted, pairs()),
             ((frames, x, x, 0 * x, pairs()), (frames, x, y, tilted, none(pairs()))),
+        ),
+        "refine.uncertainty.scan_covariance": Row(
+            lambda x, y, across, these, centre: uncertainty.scan_covariance(
+                x, y, across, these, WIDE, centre
+            ),
+            (x, y, tilted, pairs(), np.zeros(3)),
+            ((x, x, 0 * x, pairs(), np.zeros(3)), (x, y, tilted, none(pairs()), np.zeros(3))),
+            smooth=False,
         ),
     }
 
