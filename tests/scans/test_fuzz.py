@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 
-pytestmark = pytest.mark.untyped
+pytestmark = [pytest.mark.slow, pytest.mark.untyped]
 
 EXAMPLES = 10_000 if settings.get_current_profile_name() == "fuzz" else 240
 REMEDY = re.compile(r"give|remove|pass|use|need|at least|must be|drop", re.IGNORECASE)

@@ -255,6 +255,7 @@ def test_derivatives_at_generic_inputs(name, row, seed):
         np.testing.assert_allclose(t, difference, rtol=1e-6, atol=1e-7 * scale)
 
 
+@pytest.mark.slow
 @rows([name for name in DIFFERENTIABLE if TABLE[name].degenerate])
 def test_derivatives_are_finite_and_modes_agree_at_degenerate_inputs(name, row, seed):
     rng = np.random.default_rng(seed)
@@ -270,6 +271,7 @@ def test_derivatives_are_finite_and_modes_agree_at_degenerate_inputs(name, row, 
             np.testing.assert_allclose(reverse, forward, atol=1e-7 * size, err_msg=message)
 
 
+@pytest.mark.slow
 @rows(["network.losses.step_losses"])
 def test_derivatives_hold_in_optimised_kernels_too(name, row, seed):
     """The other tests compile without LLVM's optimisation, which may round a repeated computation
