@@ -134,8 +134,9 @@ def row(request):
     return row
 
 
-def rows(names):
-    return pytest.mark.parametrize(("name", "row"), [(n, n) for n in names], indirect=["row"])
+def rows(names, *, slow=()):
+    marked = [pytest.param(n, n, marks=pytest.mark.slow if n in slow else ()) for n in names]
+    return pytest.mark.parametrize(("name", "row"), marked, indirect=["row"])
 
 
 each_row = rows(sorted(name for name, row in TABLE.items() if row.generic and not row.parts))
@@ -239,7 +240,12 @@ def derivatives(name, row, inputs, rng):
 DIFFERENTIABLE = sorted(name for name, row in TABLE.items() if row.generic)
 
 
-@rows(DIFFERENTIABLE)
+WHOLE_SEARCHES = [
+    name for name in DIFFERENTIABLE if name.startswith(("search.pipe", "search.stag"))
+]
+
+
+@rows(DIFFERENTIABLE, slow=WHOLE_SEARCHES)
 def test_derivatives_at_generic_inputs(name, row, seed):
     rng = np.random.default_rng(seed)
     _, tangent, gradient, at, products = derivatives(name, row, row.generic, rng)
