@@ -24,9 +24,10 @@ from benchmarks.scans import sensors
 from jaxreg.cli import process
 from jaxreg.data import data_root
 from jaxreg.judge.evidence import Evidence
-from jaxreg.judge.odds import features
+from jaxreg.judge.odds import WEIGHTS, features, probabilities
 from jaxreg.scans import candidates, pair, prepare
 from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.verdict import TRUSTED
 from jaxreg.types import RigidTransform
 from research.judge_pairs import KINDS, made_pairs
 
@@ -34,12 +35,13 @@ _PENALTY = 1.0
 _ALIKE = ("redkitchen", "redkitchen_lomatch", "redkitchen_frames")
 """Sets of one sensor and one room: they are left out together."""
 _MORE, _LESS, _ANY = (0, None), (None, 0), (None, None)
-_SIGN = {
+_BOUNDS = {
     "smaller": _MORE, "larger": _ANY, "distance": _LESS, "rough_distance": _LESS,
     "rough_facing": _MORE, "disagreement": _LESS, "beside": _ANY, "unseen": _LESS, "rough": _MORE,
-    "ends": _ANY, "held": _MORE,
+    "ends": _ANY, "held": _MORE, "same": (WEIGHTS.same,) * 2, "sparse": (WEIGHTS.sparse,) * 2,
 }  # fmt: skip
-"""Whether evidence may speak for a pose or against it: few sensors must not turn that around."""
+"""Bounds of the weights. Few sensors must not turn around what speaks for a pose and what against it;
+the two that are set by hand (`odds.py`) stay as they are."""
 _WEIGHT = {"ends": 0.2, "unrelated": 0.5, "crops": 2.0}
 """Weight of a pair, 1 for the others: the ends of many shapes are congruent, and no evidence tells
 that they are two; crops stand for all pairs of `register_global`."""
@@ -124,7 +126,8 @@ def load(folder: Path) -> list[dict]:
 
 def design(entry: dict) -> np.ndarray:
     """The features of every pose, as `log_odds` takes them."""
-    return np.stack([np.asarray(f) for f in features(Evidence(*entry["evidence"].T))], axis=1)
+    known = features(Evidence(*entry["evidence"].T))
+    return np.stack(np.broadcast_arrays(*known), axis=1)
 
 
 def fitted(entries: list[dict]) -> np.ndarray:
@@ -149,31 +152,33 @@ def fitted(entries: list[dict]) -> np.ndarray:
             slope += np.append(change.sum(), x.T @ change)
         return total, slope
 
-    bounds = [(None, None), *(_SIGN[name] for name in Evidence._fields)]
+    bounds = [(None, None)]
+    for name, unit in zip(Evidence._fields, spread, strict=True):
+        bounds.append(tuple(end if end is None else end * unit for end in _BOUNDS[name]))
     start = np.zeros(every.shape[1] + 1)
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[1:] / spread
     return np.append(found[0] - weights @ middle, weights)
 
 
-def chances(weights: np.ndarray, entry: dict) -> np.ndarray:
-    """The probability of every pose."""
-    score = np.append(weights[0] + design(entry) @ weights[1:], 0)
-    chance = np.exp(score - score.max())
-    return (chance / chance.sum())[:-1]
+def likeliest(weights: np.ndarray, entry: dict) -> tuple[float, bool]:
+    """The probability of the likeliest pose, and whether it is right."""
+    chance = np.asarray(probabilities(weights[0] + design(entry) @ weights[1:]))
+    best = int(np.argmax(chance))
+    return float(chance[best]), bool(entry["right"][best])
 
 
-def judge(weights: np.ndarray, entries: list[dict]) -> dict[str, int]:
+def judge(entries: list[dict], best: list[tuple[float, bool]]) -> dict[str, int]:
     """How often the likeliest pose is right, and believed."""
-    counts = {"pairs": len(entries), "possible": 0, "right": 0, "believed": 0, "wrong": 0}
-    for entry in entries:
-        chance = chances(weights, entry)
-        best = int(np.argmax(chance))
-        right, success = bool(entry["right"][best]), chance[best] >= 0.5
-        counts["possible"] += bool(entry["right"].any())
+    counts = {
+        "pairs": len(entries), "right": 0, "believed": 0, "wrong": 0,
+        "possible": sum(bool(entry["right"].any()) for entry in entries),
+    }  # fmt: skip
+    for chance, right in best:
+        success = chance >= TRUSTED
         counts["right"] += right
-        counts["believed"] += int(right and success)
-        counts["wrong"] += int(not right and success)
+        counts["believed"] += right and success
+        counts["wrong"] += not right and success
     return counts
 
 
@@ -196,15 +201,10 @@ def report(entries: list[dict]) -> None:
         own = [entry for entry in entries if entry["set"] == name]
         for label, low in (("low", True), ("high", False)):
             if group := [e for e in own if (e["overlap"] < sensors.LOW) is low]:
-                best = [
-                    (chances(weights, e).max(), bool(e["right"][np.argmax(chances(weights, e))]))
-                    for e in group
-                ]
-                print(
-                    f"{name:20s} {label:5s}", judge(weights, group), f"ECE {calibration(best):.3f}"
-                )
+                best = [likeliest(weights, entry) for entry in group]
+                print(f"{name:20s} {label:5s}", judge(group, best), f"ECE {calibration(best):.3f}")
     weights = fitted(entries)
-    print("all", judge(weights, entries))
+    print("all", judge(entries, [likeliest(weights, entry) for entry in entries]))
     print(f"INTERCEPT = {weights[0]:.3f}")
     print(Evidence(*(round(float(w), 3) for w in weights[1:])))
 

@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.random import Generator
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from benchmarks.scans.sensors import TruePair, make_pair
+from benchmarks.scans.sensors import TruePair, common_share, turned_pair
+from benchmarks.scans.verdict import crop
 from jaxreg.data.procedural import rooms, shapes
 from jaxreg.data.procedural.scanner import Sensor, look_at, scan
 from jaxreg.scans.prepare import voxel_reduced
@@ -74,7 +73,7 @@ def crops(rng: Generator, index: int) -> _Made:
     cloud = shapes.sample_shape(91, index, points=2048).astype(np.float64)
     cloud = cloud[rng.permutation(len(cloud))]
     share = rng.choice([0.5, 0.7, 0.7, 1.0])
-    pair = [_cut(half, rng.normal(size=3), 1 - share, 1.0) for half in np.split(cloud, 2)]
+    pair = [crop(half, rng, share) for half in np.split(cloud, 2)]
     if index % 2:
         pair = [x + np.clip(0.01 * rng.normal(size=x.shape), -0.05, 0.05) for x in pair]
     return *pair, np.eye(4), 0.06, (5.0, 0.1)
@@ -117,7 +116,7 @@ def made_pairs(kind: str, count: int, seed: int = 0) -> Iterator[TruePair]:
             source, reference, truth, reach, within = KINDS[kind](rng, index)
             if min(len(source), len(reference)) < 200:
                 continue
-            overlap = 0.0 if truth is None else _overlap(source, reference, truth, reach)
+            overlap = 0.0 if truth is None else common_share(source, reference, truth, reach)
             small = rng.random() < 0.65
             if kind not in ("frames", "lidar", "turntable"):
                 break
@@ -125,14 +124,8 @@ def made_pairs(kind: str, count: int, seed: int = 0) -> Iterator[TruePair]:
                 break
         else:
             continue
-        turn = Rotation.random(random_state=rng).as_matrix()
-        source, name = source @ turn.T, f"{kind}/{index}"
-        if truth is None:
-            yield TruePair(name, source, reference, None, 0.0, within, source.mean(axis=0))
-            continue
-        back = np.eye(4)
-        back[:3, :3] = turn.T
-        yield make_pair(name, source, reference, truth @ back, overlap, within, reach)
+        name = f"{kind}/{index}"
+        yield turned_pair(rng, name, source, reference, truth, overlap, within, reach)
 
 
 def _scanned(rng: Generator, views, sensor: Sensor, points: int, voxel: float):
@@ -150,11 +143,3 @@ def _scanned(rng: Generator, views, sensor: Sensor, points: int, voxel: float):
 def _cut(cloud: np.ndarray, along: np.ndarray, low: float, high: float) -> np.ndarray:
     place = cloud @ along
     return cloud[(place >= np.quantile(place, low)) & (place <= np.quantile(place, high))]
-
-
-def _overlap(source, reference, truth, reach: float) -> float:
-    moved = source @ truth[:3, :3].T + truth[:3, 3]
-    return min(
-        float((cKDTree(b).query(a)[0] < reach).mean())
-        for a, b in ((moved, reference), (reference, moved))
-    )

@@ -65,9 +65,10 @@ def test_training_on_a_folder_runs_as_its_guide_says(folder):
     (folder / "configs").symlink_to(ROOT / "configs")
     outputs = []
     for command, options in zip(commands[:2], (short, "--pairs 2"), strict=True):
-        _, script, *rest = shlex.split(command)
+        program, *rest = shlex.split(command)
+        assert program == "jaxreg"
         done = subprocess.run(
-            [sys.executable, ROOT / script, *rest, *options.split()],
+            [sys.executable, "-c", "import jaxreg.cli; jaxreg.cli.main()", *rest, *options.split()],
             env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache")},
             capture_output=True, text=True, check=True,
         )  # fmt: skip
@@ -75,7 +76,7 @@ def test_training_on_a_folder_runs_as_its_guide_says(folder):
     assert "curves.png: runs/own" in outputs[0]
     assert (folder / "runs" / "own" / "curves.png").is_file()
     assert "MAE(R) deg" in outputs[1]
-    shown = next(block[3] for block in blocks if block[2].startswith("python train.py"))
+    shown = next(block[3] for block in blocks if block[2].startswith("jaxreg train"))
     assert forms(shown) <= forms("".join(outputs))
 
 

@@ -3,10 +3,17 @@
 import runpy
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(autouse=True)
+def _as_users_have_it():
+    with jax.numpy_rank_promotion("allow"):
+        yield
 
 
 @pytest.mark.float32

@@ -18,6 +18,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from benchmarks import record
+from benchmarks.scans.sensors import logged_pairs
 from jaxreg.cli import process
 from jaxreg.data import data_root
 from jaxreg.data.seven_scenes import read_fragment
@@ -109,13 +110,7 @@ def scan_pairs(folder: Path, overlap: float) -> list[tuple[int, int, np.ndarray]
         for name, i, j, a, b, *_ in rows
         if name == "3DMatch" and (float(a) + float(b)) / 2 >= overlap
     }
-    lines = (folder / "gt.log").read_text().splitlines()
-    found = []
-    for k in range(0, len(lines), 5):
-        i, j = (int(x) for x in lines[k].split()[:2])
-        if (i, j) in enough:
-            found.append((i, j, np.array([row.split() for row in lines[k + 1 : k + 5]], float)))
-    return found
+    return [pair for pair in logged_pairs(folder / "gt.log") if pair[:2] in enough]
 
 
 def turned(points: np.ndarray, rng: np.random.Generator, rotation: Turn) -> np.ndarray:

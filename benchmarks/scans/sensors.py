@@ -72,17 +72,36 @@ def true_pairs(root: Path, sensor: str) -> Iterator[TruePair]:
     for number, (source, reference, truth, overlap, reach) in enumerate(listed):
         name = f"{sensor}/{number}"
         rng = np.random.default_rng(zlib.crc32(name.encode()))
-        turn = Rotation.random(random_state=rng).as_matrix()
-        truth = truth @ _matrix(turn.T)
-        yield make_pair(name, source @ turn.T, reference, truth, overlap, RIGHT[sensor], reach)
+        yield turned_pair(rng, name, source, reference, truth, overlap, RIGHT[sensor], reach)
 
 
-def make_pair(name, source, reference, truth, overlap, within, reach) -> TruePair:
-    """A pair whose errors are measured at the centroid of the overlapping part."""
-    moved = source @ truth[:3, :3].T + truth[:3, 3]
-    near = cKDTree(reference).query(moved, distance_upper_bound=reach)[0] < np.inf
-    centre = source[near].mean(axis=0) if near.any() else source.mean(axis=0)
+def turned_pair(
+    rng: np.random.Generator, name, source, reference, truth, overlap, within, reach
+) -> TruePair:
+    """A pair with its source turned by any rotation; `truth` is None where nothing is common.
+
+    Errors are measured at the centroid of the overlapping part.
+    """
+    turn = Rotation.random(random_state=rng).as_matrix()
+    source = source @ turn.T
+    centre = source.mean(axis=0)
+    if truth is not None:
+        truth = truth.copy()
+        truth[:3, :3] = truth[:3, :3] @ turn.T
+        near = (
+            cKDTree(reference).query(_moved(source, truth), distance_upper_bound=reach)[0] < np.inf
+        )
+        centre = source[near].mean(axis=0) if near.any() else centre
     return TruePair(name, source, reference, truth, overlap, within, centre)
+
+
+def common_share(source, reference, truth: np.ndarray, reach: float) -> float:
+    """Share of the points of either cloud, the smaller of the two, within `reach` of the other."""
+    moved = _moved(source, truth)
+    return min(
+        float((cKDTree(b).query(a)[0] < reach).mean())
+        for a, b in ((moved, reference), (reference, moved))
+    )
 
 
 def _drawn(root: Path, sensor: str):
@@ -103,25 +122,22 @@ def _listed(root: Path, sensor: str):
     folder = root / _FRAGMENTS
     if not folder.is_dir():
         return
-    lines = (folder / _LISTS[sensor]).read_text().splitlines()
-    for start in range(0, len(lines) - 4, 5):
-        first, second = (int(word) for word in lines[start].split()[:2])
-        truth = np.array([line.split() for line in lines[start + 1 : start + 5]], np.float64)
-        reference, source = (
-            read_fragment(folder / f"cloud_bin_{i}.ply").astype(np.float64) for i in (first, second)
-        )
-        moved = source @ truth[:3, :3].T + truth[:3, 3]
-        overlap = min(
-            float((cKDTree(b).query(a)[0] < _FRAGMENT_REACH).mean())
-            for a, b in ((moved, reference), (reference, moved))
-        )
+    for first, second, truth in logged_pairs(folder / _LISTS[sensor]):
+        reference, source = (read_fragment(folder / f"cloud_bin_{i}.ply") for i in (first, second))
+        overlap = common_share(source, reference, truth, _FRAGMENT_REACH)
         yield source, reference, truth, overlap, _FRAGMENT_REACH
 
 
-def _matrix(rotation: np.ndarray) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
+def logged_pairs(path: Path) -> Iterator[tuple[int, int, np.ndarray]]:
+    """(i, j, T) of a log of 3DMatch; T maps fragment j into the frame of fragment i."""
+    lines = path.read_text().splitlines()
+    for k in range(0, len(lines) - 4, 5):
+        i, j = (int(word) for word in lines[k].split()[:2])
+        yield i, j, np.array([row.split() for row in lines[k + 1 : k + 5]], float)
+
+
+def _moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ _POINTS = 20_000
 """Points drawn from a surface; a file without faces gives its vertices."""
 _GLUED = re.compile(rb"^\s*([CN]*OFF)[ \t]*(?=[\d-])")
 """ModelNet has files that begin with "OFF1568 1242 0" on one line."""
-SUFFIXES = (".obj", ".off", ".stl", ".glb", ".ply")
+SUFFIXES = (".stl", ".obj", ".off", ".glb", ".ply")
 _NARROW = (".stl", ".glb")
 """Formats that store coordinates in single precision."""
 

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from jaxreg.io import arrays, las, mesh, packed, pcd, ply, text
 from jaxreg.io.places import check_folder
 
-_MESHES = (".stl", ".obj", ".off", ".glb", ".ply")
 _TEXT = text.SUFFIXES
 _LAS = (".las", ".laz")
 WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
@@ -58,7 +57,7 @@ def check_output(path: Path, source: Path) -> None:
     if kind == ".gz":
         raise ValueError(f"{path}: nothing is packed here: leave .gz out, and run gzip afterwards.")
     known = kind in WRITERS or (kind in _TEXT and origin in _TEXT)
-    if kind in _MESHES and kind not in WRITERS:
+    if kind in mesh.SUFFIXES and kind not in WRITERS:
         known = _may_be_mesh(source)
         if not known:
             raise ValueError(
@@ -68,7 +67,7 @@ def check_output(path: Path, source: Path) -> None:
     if not known:
         raise ValueError(
             f"{path}: clouds cannot be written as '{path.suffix}': choose one of "
-            f"{', '.join(WRITERS)}; meshes also as {', '.join(_MESHES)}."
+            f"{', '.join(WRITERS)}; meshes also as {', '.join(mesh.SUFFIXES)}."
         )
     if kind in _LAS:
         las.check_installed(path)
@@ -98,7 +97,7 @@ def write_moved(
         if own is not None:
             own(path, file, rotation, translation)
             return ()
-        if kind in _MESHES and (kind not in WRITERS or mesh.is_mesh(file)):
+        if kind in mesh.SUFFIXES and (kind not in WRITERS or mesh.is_mesh(file)):
             mesh.write_moved(path, file, rotation, translation)
             moved = points @ rotation.T + translation
             return _rounding(kind, moved)
@@ -120,7 +119,7 @@ def _may_be_mesh(source: Path) -> bool:
     origin = packed.suffix(source)
     if origin == ".ply" and source.suffix.lower() != ".gz":
         return ply.has_faces(source)
-    return origin in _MESHES
+    return origin in mesh.SUFFIXES
 
 
 def _rounding(kind: str, points: np.ndarray) -> tuple[str, ...]:

@@ -30,6 +30,10 @@ _APART, _ACROSS = 1.0, 0.7
 """A near point disagrees where it is this many spacings off the plane, or its cosine is below."""
 _FEW, _MORE = 20.0, 50.0
 """Points that the priors of means and of shares count for, so that a handful says little."""
+_SAME = 0.02
+"""Two points so many spacings apart are one point: copies of a cloud share them, scans hardly any."""
+_MANY = 4096
+"""Clouds of fewer points than these show less."""
 _LEAST = 1e-6
 """Of `held`, where nothing resists a motion."""
 
@@ -47,9 +51,11 @@ class Evidence(NamedTuple):
     Per near point, `beside` is the number of points that lie just off the other cloud, and `unseen`
     that of those just off its *interior*: if a scan does not end there, it should have seen these
     points, too. `rough` is the share of near points that are rough, `ends` the share whose partner
-    lies where its surface ends. `held` is how strongly the
-    near surfaces resist the motion that they resist least; 4/15 for surfaces that face all
-    directions everywhere, 0 for a plane.
+    lies where its surface ends. `held` is how strongly the near surfaces resist the motion that they
+    resist least; 4/15 for surfaces that face all directions everywhere, 0 for a plane.
+    `same` is the share of the points that coincide with one of the other cloud, of the cloud that
+    has more of them: 0 for two scans, 1 for a copy. `sparse` grows from 0 for clouds of 4,096 points
+    to 1 for clouds of hardly any.
     """
 
     smaller: Float[Any, "*k"]
@@ -63,6 +69,8 @@ class Evidence(NamedTuple):
     rough: Float[Any, "*k"]
     ends: Float[Any, "*k"]
     held: Float[Any, "*k"]
+    same: Float[Any, "*k"] = 0.0
+    sparse: Float[Any, "*k"] = 0.0
 
 
 def read_evidence(
@@ -92,7 +100,10 @@ def read_evidence(
     other = _one_way(fewer, moved, back, spacing)
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, other)
     near, rough = both.near, both.near & both.rough
-    shares = [_share(side, cloud.mask) for side, cloud in ((one, few), (other, fewer))]
+    sides = ((one, few), (other, fewer))
+    shares = [_share(side.near, side, cloud.mask) for side, cloud in sides]
+    copied = [_share(side.same, side, cloud.mask) for side, cloud in sides]
+    points = [_count(cloud.mask, spacing) for cloud in (source, reference)]
     seen = _count(near, both.across)
     off = (both.across > _APART) | (both.cosine < _ACROSS)
     return Evidence(
@@ -107,6 +118,8 @@ def read_evidence(
         rough=_count(rough, both.across) / (seen + _FEW),
         ends=_sum(both.ends, near) / (seen + _MORE),
         held=_held(few.points, reference.normals[there], one.near),
+        same=jnp.maximum(*copied),
+        sparse=jnp.maximum(1 - jnp.minimum(*points) / _MANY, 0),
     )
 
 
@@ -114,6 +127,7 @@ class _Side(NamedTuple):
     """Of every point of one cloud: whether it is near the other, and how well it agrees there."""
 
     near: Bool[Array, "n"]
+    same: Bool[Array, "n"]
     beside: Bool[Array, "n"]
     unseen: Float[Array, "n"]
     ends: Float[Array, "n"]
@@ -131,6 +145,7 @@ def _one_way(moved: Examined, other: Examined, partner: Int[Array, "n"], spacing
     valid = moved.mask & other.mask[partner]
     return _Side(
         near=valid & (far < NEAR),
+        same=valid & (far < _SAME),
         beside=valid & (far > NEAR) & (far < REACH),
         unseen=jnp.where(valid & (far > _UNSEEN) & (far < REACH), other.interior[partner], 0),
         ends=1 - other.interior[partner],
@@ -154,8 +169,8 @@ def _mean(values: Array, chosen: Array, *, prior: float) -> Array:
     return (_sum(values, chosen) + prior * _FEW) / (_count(chosen, values) + _FEW)
 
 
-def _share(side: _Side, mask: Array) -> Array:
-    return _count(side.near, side.across) / jnp.maximum(_count(mask, side.across), 1)
+def _share(chosen: Array, side: _Side, mask: Array) -> Array:
+    return _count(chosen, side.across) / jnp.maximum(_count(mask, side.across), 1)
 
 
 def _count(chosen: Array, like: Array) -> Array:

@@ -1,6 +1,5 @@
 """The poses that a search proposes for two scans, refined and judged with more points than it had."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -22,12 +21,6 @@ _REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True,
 """How a pose is refined before it is judged: surfaces a spacing apart say little."""
 _STEP = 2
 """Every second point looks for a partner then."""
-_SAME, _SAME_ODDS = 0.02, 30.0
-"""Two points so many spacings apart are one point: scans share none but by chance, copies of a cloud
-do, and then nothing tells more. Log odds if all of them coincide."""
-_MANY, _SPARSE_DOUBT = 4096, 3.0
-"""Fewer points than these show less: log odds that a pose loses if there are hardly any. Chosen on
-the ends and crops of the fit (research/fit_judge.py), which have 700 to 1,900 points."""
 _COUNTS = (1, 4, 16, 64)
 """Poses are judged in batches of these sizes, so that few programs are compiled."""
 
@@ -56,9 +49,8 @@ class Clouds(NamedTuple):
             for cloud, index in zip(self.examined, self[:2], strict=True)
         )
         reach = 1.0001 * REACH * max(spacings)
-        apart, there = self.reference.nearest(self.source.moved_by(poses), within=reach)
+        there = self.reference.nearest(self.source.moved_by(poses), within=reach)[1]
         back = self.source.nearest(self.reference.moved_back_by(poses), within=reach)[1]
-        same = np.mean(apart < _SAME / REACH * reach, axis=1)[:count]
         there, back = (
             np.pad(index.astype(np.int32), [(0, 0), (0, len(cloud.padded) - index.shape[1])])
             for index, cloud in zip((there, back), self[:2], strict=True)
@@ -66,9 +58,7 @@ class Clouds(NamedTuple):
         scales = self.source.scale, self.reference.scale
         evidence, score = _read(poses, *self.examined, scales, there, back)
         evidence = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
-        fewest = min(len(cloud.points) for cloud in self[:2])
-        doubt = _SPARSE_DOUBT * max(0.0, 1 - fewest / _MANY)
-        return evidence, np.asarray(score, np.float64)[:count] + _SAME_ODDS * same - doubt
+        return evidence, np.asarray(score, np.float64)[:count]
 
 
 def _padded(poses: RigidTransform) -> RigidTransform:
@@ -85,8 +75,8 @@ def _read(poses, source, reference, scales, there, back):
         for cloud, scale in zip((source, reference), scales, strict=True)
     )
     poses = RigidTransform(*(part.astype(source.points.dtype) for part in poses))
-    read = functools.partial(read_evidence, source=source, reference=reference)
-    evidence = jax.vmap(lambda p, i, j: read(p, there=i, back=j))(poses, there, back)
+    read = jax.vmap(read_evidence, in_axes=(0, None, None, 0, 0))
+    evidence = read(poses, source, reference, there, back)
     return evidence, log_odds(evidence)
 
 

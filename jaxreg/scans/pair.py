@@ -118,6 +118,12 @@ class Problem(NamedTuple):
             source, reference, (sides[0].fine.examined, sides[1].fine.examined)
         )
 
+    def reach(self) -> float:
+        """The largest distance between corresponding points of the fine levels, in the frame."""
+        clouds, length = (self.source, self.reference), float(self.where.length)
+        spacings = (cloud.fine.spacing * cloud.radius / length for cloud in clouds)
+        return self.config.refine_spacings * min(self.spacing, max(prepare.FINEST, *spacings))
+
 
 class _Found(NamedTuple):
     """The chosen pose in the frame, and the others with their log odds."""
@@ -238,14 +244,9 @@ def searched_and_judged(problem: Problem, most: float, search: SearchConfig) -> 
     """The distinct poses of one search, refined and judged; they turn by at most `most` radians."""
     first = search == problem.config.search
     poses, score = _searched_poses(problem, most, search, problem.config.learned or not first)
-    spacing = max(
-        cloud.fine.spacing * cloud.radius for cloud in (problem.source, problem.reference)
-    )
-    distance = problem.config.refine_spacings * min(
-        problem.spacing, max(prepare.FINEST, spacing / float(problem.where.length))
-    )
+    most_poses = _FIRST if first else _WIDE
     return candidates.judged(
-        problem.clouds(), poses, score, distance=distance, most=_FIRST if first else _WIDE
+        problem.clouds(), poses, score, distance=problem.reach(), most=most_poses
     )
 
 
@@ -293,15 +294,10 @@ def _refine(problem: Problem, pose: RigidTransform) -> Refined:
     config = problem.config
     if config.refine is None:
         return unrefined(pose)
-    source, reference, where = problem.source, problem.reference, problem.where
-    clouds = [cloud.in_frame(cloud.fine, where) for cloud in (source, reference)]
     given = config.refine.max_correspondence_distance
-    if math.isfinite(given):
-        distance = given / float(where.length)
-    else:
-        spacings = (c.fine.spacing * c.radius / float(where.length) for c in (source, reference))
-        distance = config.refine_spacings * min(problem.spacing, max(prepare.FINEST, *spacings))
-    return refine_indexed(*clouds, initial=pose, distance=distance, config=config.refine)
+    distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
+    source, reference, _ = problem.clouds()
+    return refine_indexed(source, reference, initial=pose, distance=distance, config=config.refine)
 
 
 def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistration:
@@ -377,11 +373,8 @@ def _nearest(problem: Problem, pose: RigidTransform) -> tuple[np.ndarray, np.nda
 
 def _overlap(problem: Problem, pose: RigidTransform) -> float:
     """Share of the points of both clouds, at one density, within reach of the other."""
-    length = float(problem.where.length)
     sides = zip(problem.levels, (problem.source, problem.reference), strict=True)
-    source, reference = (
-        level.index._replace(scale=cloud.radius / length) for level, cloud in sides
-    )
+    source, reference = (cloud.in_frame(level, problem.where) for level, cloud in sides)
     within = problem.distance
     there = reference.nearest(source.moved_by(pose), within=within)[0]
     back = source.nearest(reference.moved_back_by(pose), within=within)[0]

@@ -13,8 +13,14 @@ _LEAST_HELD = 1e-5
 _USUAL = Evidence(
     smaller=0.75, larger=0.85, distance=0.25, rough_distance=0.35, rough_facing=0.85,
     disagreement=0.08, beside=0.3, unseen=0.03, rough=0.3, ends=0.1, held=0.1,
+    same=0.0, sparse=0.0,
 )  # fmt: skip
 """What a usual right pose shows, which `reason` compares with."""
+_SPEAKS = Evidence(
+    smaller=1, larger=1, distance=-1, rough_distance=-1, rough_facing=1, disagreement=-1, beside=-1,
+    unseen=-1, rough=1, ends=-1, held=1, same=1, sparse=-1,
+)  # fmt: skip
+"""Whether more of it speaks for a pose or against it, as the sentences of `reason` presume."""
 
 
 def is_free(found: Evidence) -> bool:
@@ -33,6 +39,8 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> s
     if rivals >= 0.25:
         return "Another pose agrees about as well (see alternatives)."
     short = np.array(WEIGHTS) * (np.array(features(found)) - np.array(features(_USUAL)))
+    # The sentence of a field whose fitted weight has the other sign would say what is not the case.
+    short = np.where(np.array(WEIGHTS) * np.array(_SPEAKS) > 0, short, 0)
     held = ", ".join(direction.name for direction in weak) or "see sigma"
     texts = Evidence(
         smaller=f"Only {found.smaller:.0%} of one of the clouds lies near the other.",
@@ -49,5 +57,7 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> s
         rough="The surfaces that meet are flat, and a flat surface agrees with every other.",
         ends="The surfaces meet where they end.",
         held=f"The surfaces hardly resist a motion: {held}.",
+        same="No points coincide.",
+        sparse="The clouds have few points.",
     )
     return texts[int(np.argmin(short))]

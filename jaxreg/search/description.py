@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.geometry.neighbors import knn, squared_distances, without_padding
-from jaxreg.judge.surface import NEIGHBORS, Examined, examine
+from jaxreg.geometry.neighbors import squared_distances, without_padding
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.descriptors import (
     INVARIANTS,
@@ -35,7 +34,8 @@ class Described(NamedTuple):
 
     `normals` are of length 1 and arbitrary sign, `openness` says where the surface ends,
     `features` are the raw `descriptors.moments`, `spacing` is the mean distance to the nearest
-    point. Rows with `mask` False are padding.
+    point. `neighbors`, if known, are rows of the nearest other points; a judged search computes
+    them otherwise. Rows with `mask` False are padding.
     """
 
     points: Float[Array, "n 3"]
@@ -45,7 +45,7 @@ class Described(NamedTuple):
     mask: Bool[Array, "n"]
     grid: NearestGrid
     spacing: Float[Array, ""]
-    examined: Examined
+    neighbors: Int[Array, "n k"] | None
 
 
 class Compared(NamedTuple):
@@ -89,8 +89,6 @@ def describe(
     if normals is None:
         normals = gaussian_normals(points, squared, valid)
     normals = jax.lax.stop_gradient(without_padding(normals, valid))
-    if neighbors is None:
-        neighbors = knn(points, min(NEIGHBORS, len(points) - 1), valid)
     return Described(
         points,
         normals,
@@ -99,7 +97,7 @@ def describe(
         valid,
         nearest_grid(points, valid, margin=SCREEN_WIDTH),
         mean_spacing(squared, valid),
-        examine(points, normals, neighbors, valid),
+        neighbors,
     )
 
 

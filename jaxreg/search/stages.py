@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import rigid
+from jaxreg.geometry.neighbors import knn
 from jaxreg.judge.evidence import read_evidence
 from jaxreg.judge.odds import log_odds
-from jaxreg.judge.surface import Examined
+from jaxreg.judge.surface import NEIGHBORS, Examined, examine
 from jaxreg.search.alignment import align_coarse, align_fine
 from jaxreg.search.candidates import MATCHES, select_candidates
 from jaxreg.search.compatibility import compatibility
@@ -63,12 +64,15 @@ class Search(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Two clouds to align, and what all stages need to know about them."""
+    """Two clouds to align, and what all stages need to know about them.
+
+    `examined` is None unless the poses are judged.
+    """
 
     source: Surface
     reference: Surface
     grids: tuple[NearestGrid, NearestGrid]
-    examined: tuple[Examined, Examined]
+    examined: tuple[Examined, Examined] | None
     sparsity: Float[Array, ""]
     max_angle: Float[Array, ""] | float
 
@@ -99,13 +103,20 @@ def search_described(
         compared.source,
         compared.reference,
         (source.grid, reference.grid),
-        (source.examined, reference.examined),
+        (_examined(source), _examined(reference)) if config.judged else None,
         sparsity_factor(source.spacing, reference.spacing),
         max_angle,
     )
     poses = _screened(_hypotheses(compared, config), also, problem, config)
     poses = _shortlisted(_coarsely_aligned(poses, problem), problem, config)
-    return _ranked(_finely_aligned(poses, problem), problem, config)
+    return _ranked(_finely_aligned(poses, problem), problem)
+
+
+def _examined(cloud: Described) -> Examined:
+    neighbors = cloud.neighbors
+    if neighbors is None:
+        neighbors = knn(cloud.points, min(NEIGHBORS, len(cloud.points) - 1), cloud.mask)
+    return examine(cloud.points, cloud.normals, neighbors, cloud.mask)
 
 
 def _check_search(source: Described, reference: Described, similarity, also, max_angle) -> None:
@@ -184,22 +195,28 @@ def _coarsely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransfor
 
 def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> RigidTransform:
     """The distinct poses that score best at a glance: the fine alignment is what takes time."""
-    grids, (source, reference), sparsity, max_angle = problem[2:]
-    few, fewer = (cloud.points[::_COARSE_STEP] for cloud in (source, reference))
-
-    def at_a_glance(pose: RigidTransform):
-        if not config.judged:
-            terms = score_terms_by_grid(
-                pose, problem.source, problem.reference, grids, step=_COARSE_STEP, sparsity=sparsity
-            )
-            return score_of(terms)
-        there = lookup(grids[1], rigid.apply(pose, few))
-        back = lookup(grids[0], rigid.apply(rigid.inverse(pose), fewer))
-        return log_odds(read_evidence(pose, source, reference, there, back, step=_COARSE_STEP))
-
-    score, allowed = jax.vmap(at_a_glance)(poses), _turns_less(poses, max_angle)
+    at_a_glance = _score_at_a_glance if problem.examined is None else _odds_at_a_glance
+    score = jax.vmap(lambda pose: at_a_glance(pose, problem))(poses)
+    allowed = _turns_less(poses, problem.max_angle)
     count = min(config.aligned, len(score))
     return best_of(poses, pick_distinct(poses, score, allowed, count=count, apart=_ALIGNED_APART))
+
+
+def _score_at_a_glance(pose: RigidTransform, problem: _Problem) -> Float[Array, ""]:
+    source, reference, grids, _, sparsity, _ = problem
+    terms = score_terms_by_grid(
+        pose, source, reference, grids, step=_COARSE_STEP, sparsity=sparsity
+    )
+    return score_of(terms)
+
+
+def _odds_at_a_glance(pose: RigidTransform, problem: _Problem) -> Float[Array, ""]:
+    assert problem.examined is not None
+    source, reference = problem.examined
+    few, fewer = (cloud.points[::_COARSE_STEP] for cloud in (source, reference))
+    there = lookup(problem.grids[1], rigid.apply(pose, few))
+    back = lookup(problem.grids[0], rigid.apply(rigid.inverse(pose), fewer))
+    return log_odds(read_evidence(pose, source, reference, there, back, step=_COARSE_STEP))
 
 
 def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
@@ -207,11 +224,14 @@ def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
     return jax.lax.map(lambda pose: align_fine(pose, few, fewer), poses)
 
 
-def _ranked(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> Search:
+def _ranked(poses: RigidTransform, problem: _Problem) -> Search:
     """The poses, the allowed ones first, then by what speaks for them."""
     # Again, because alignment may have turned a pose out of the bounds of the search.
     allowed = _turns_less(poses, problem.max_angle)
-    score = _judged(poses, problem) if config.judged else _scored(poses, problem, allowed)
+    if problem.examined is None:
+        score = _scored(poses, problem, allowed)
+    else:
+        score = _judged(poses, *problem.examined)
     order = jnp.lexsort((-score, ~allowed))
     return Search(best_of(poses, order), score[order], allowed[order])
 
@@ -228,9 +248,8 @@ def _scored(
     return break_ties(score_of(terms), terms.plane, allowed)
 
 
-def _judged(poses: RigidTransform, problem: _Problem) -> Float[Array, "s"]:
+def _judged(poses: RigidTransform, source: Examined, reference: Examined) -> Float[Array, "s"]:
     """The log odds of `jaxreg.judge`."""
-    source, reference = problem.examined
 
     def judged(pose: RigidTransform):
         moved = rigid.apply(pose, source.points)

@@ -141,7 +141,7 @@ def test_bad_input_is_named(name, seed):
     spoiled = reference.copy()
     spoiled[7, 1] = np.nan
     for arguments, options, message in (
-        ((source, spoiled), {}, "reference: point 7"),
+        ((source, spoiled), {}, "reference: 1 of 900 points are not finite, the first is point 7"),
         ((source[:, :2], reference), {}, r"source has shape \(900, 2\)"),
         ((source, reference[:2]), {}, "reference has 2 finite points"),
         ((source, reference), {"spacing": 0.0}, "spacing = 0.0 must be positive"),

@@ -28,7 +28,16 @@ def test_shares_and_lengths_count_by_their_logarithm(seed):
         share = getattr(found, name)
         assert np.all(np.abs(getattr(told, name) - np.log(share)) < 0.01 / share)
     np.testing.assert_allclose(told.held, np.log10(found.held), rtol=1e-12)
-    for name in ("rough_facing", "disagreement", "beside", "unseen", "rough", "ends"):
+    for name in (
+        "rough_facing",
+        "disagreement",
+        "beside",
+        "unseen",
+        "rough",
+        "ends",
+        "same",
+        "sparse",
+    ):
         np.testing.assert_array_equal(getattr(told, name), getattr(found, name))
 
 

@@ -48,7 +48,7 @@ def test_the_reason_is_what_falls_shortest(monkeypatch, wanting, told):
 
 
 def test_a_weak_motion_is_named(monkeypatch):
-    only = Evidence(*np.eye(11)[Evidence._fields.index("held")])
+    only = Evidence(*np.eye(len(Evidence._fields))[Evidence._fields.index("held")])
     monkeypatch.setattr(verdict, "WEIGHTS", only)
     slack = GOOD._replace(held=1e-4)
     assert verdict.reason(slack, (TURN,), 0.0).endswith(f"hardly resist a motion: {TURN.name}.")
@@ -58,7 +58,7 @@ def test_a_weak_motion_is_named(monkeypatch):
 @pytest.mark.parametrize("name", Evidence._fields)
 def test_every_reason_is_a_sentence(monkeypatch, name):
     weight = -1.0 if getattr(GOOD, name) < 0.5 else 1.0
-    weights = Evidence(*np.zeros(11))._replace(**{name: weight})
+    weights = Evidence(*np.zeros(len(Evidence._fields)))._replace(**{name: weight})
     monkeypatch.setattr(verdict, "WEIGHTS", weights)
     told = verdict.reason(GOOD._replace(**{name: 0.001 if weight > 0 else 3.0}), (), 0.0)
     assert told[0].isupper() or told[0].isdigit()

@@ -78,7 +78,7 @@ def test_what_is_no_cloud_is_named(shape):
     for clouds, name in (((wrong, cloud), "source"), ((cloud, wrong), "reference")):
         with pytest.raises(ValueError, match=f"{name} must have shape"):
             jax.eval_shape(lambda clouds=clouds: register_global(*clouds))
-    with pytest.raises(ValueError, match="40 and 3 rows, and the search needs 4"):
+    with pytest.raises(ValueError, match="40 and 3 rows, but the search needs 4"):
         jax.eval_shape(lambda: register_global(cloud, cloud[:3]))
     with pytest.raises(ValueError, match="must be of floats, got int32"):
         jax.eval_shape(lambda: register_global(cloud.astype(np.int32), cloud))
