@@ -40,7 +40,7 @@ from hypothesis import HealthCheck, settings
 
 mpl.use("Agg")
 with pytest.MonkeyPatch.context() as patch:
-    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
+    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=1"]
     if jax.__version_info__ < (0, 11):  # XLA ends a process that names a flag it does not know.
         flags.append("--xla_cpu_use_fusion_emitters=false")
     patch.setenv("XLA_FLAGS", " ".join(flags))
@@ -68,8 +68,6 @@ settings.load_profile("quick")
 
 
 _MOST_REGIONS = 40_000
-_MOST_BYTES = 2 * 2**30
-"""Of the cache of compiled programs: what was used least recently goes first."""
 
 
 def pytest_addoption(parser):
@@ -80,7 +78,6 @@ def pytest_configure(config):
     if config.pluginmanager.hasplugin("cacheprovider"):
         jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("xla")))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-        jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
     if config.getoption("--seed") == "random":
         config.option.seed = str(random.SystemRandom().randrange(2**31))
 

@@ -1,0 +1,29 @@
+"""Every public function of the numerical rooms under every transform of JAX.
+
+TABLE names each one with generic and degenerate inputs. For every row: jit equals eager and vmap equals
+a loop (test_values.py); forward mode equals reverse mode, both are finite, and on generic inputs they
+equal central differences in float64 (test_derivatives.py). A public function that is not in the table
+fails a test (test_table.py).
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+from tests.transforms.core_rows import core_rows
+from tests.transforms.judge_rows import judge_rows
+from tests.transforms.network_rows import network_and_model_rows
+from tests.transforms.refine_rows import refine_rows
+from tests.transforms.search_rows import search_rows
+
+TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows() | judge_rows()
+
+
+def rows(names, *, slow=()):
+    marked = [pytest.param(n, n, marks=pytest.mark.slow if n in slow else ()) for n in names]
+    return pytest.mark.parametrize(("name", "row"), marked, indirect=["row"])
+
+
+def is_float(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
