@@ -40,7 +40,7 @@ from hypothesis import HealthCheck, settings
 
 mpl.use("Agg")
 with pytest.MonkeyPatch.context() as patch:
-    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=1"]
+    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
     if jax.__version_info__ < (0, 11):  # XLA ends a process that names a flag it does not know.
         flags.append("--xla_cpu_use_fusion_emitters=false")
     patch.setenv("XLA_FLAGS", " ".join(flags))

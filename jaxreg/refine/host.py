@@ -82,14 +82,16 @@ def refine_indexed(
     initial: RigidTransform,
     distance: float,
     config: RefineConfig,
+    more: int = 0,
 ) -> Refined:
     """The same for indexed clouds in one frame: nothing is checked, thinned, indexed or scaled again.
 
-    `distance` is the largest between corresponding points, in the unit of the frame.
+    `distance` is the largest between corresponding points, in the unit of the frame. A pose that
+    still moves after `config.iterations` has up to `more` of them.
     """
     check_options(config)
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
-    pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config)
+    pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config, more=more)
     # Until here it is orthogonal only to float32.
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)
     # One pair for every point of the source, as in `pose_uncertainty`: in reverse the distances are

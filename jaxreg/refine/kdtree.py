@@ -25,6 +25,8 @@ from jaxreg.types import RigidTransform
 
 _COARSE = 30_000
 """Number of points that find the pose before all of them refine it."""
+_FAR = 2e-3
+"""Steps longer than this (radians, radii of the clouds) lead to a pose that a narrower kernel misses."""
 _SMALLEST = 512
 """Smallest padded size: below, one more compilation costs more than the padding."""
 
@@ -99,14 +101,17 @@ def iterate(
     *,
     config: RefineConfig,
     step: int = 1,
+    more: int = 0,
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
     The kernel narrows to its final width. After a step below `config.tolerance` half of the
-    remaining widths are skipped; at the final width all are. Only every `step`-th point looks for a
-    partner; large clouds first converge with fewer.
+    remaining widths are skipped; at the final width all are. Up to `more` further iterations are
+    made where the pose still moves: far at a wide kernel, at all at the final one. Only every `step`-th point looks for a partner; large
+    clouds first converge with fewer.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
+    widths = np.append(widths, np.ones(more, widths.dtype))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     stride = max(stride, step)
     levels = [(stride, widths)]
@@ -117,7 +122,7 @@ def iterate(
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
-        i, converged = 0, False
+        i, converged, spare = 0, False, more
         while i < len(widths) and not converged:
             pairs = tree_pairs(
                 pose,
@@ -132,11 +137,15 @@ def iterate(
                 weighting.max_correspondence_distance, float(widths[i]), config=settings,
             )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
-            still = _change(pose, new) < config.tolerance
+            change = _change(pose, new)
+            still = change < config.tolerance
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + config.iterations) // 2, config.iterations - 1)
-            i = max(i + 1, halfway) if still else i + 1
+            if change > _FAR and spare > 0:
+                spare -= 1
+            else:
+                i = max(i + 1, halfway) if still else i + 1
     assert pairs is not None  # there is one iteration at least
     return pose, taken, converged, pairs
 

@@ -23,9 +23,10 @@ class RegisterConfig:
         k=16,
         epsilon=0.01,
         edges=True,
+        tolerance=5e-5,
     )
-    """The refinement of the pose that the search finds, or of the start; None leaves it as it
-    is."""
+    """The refinement of the pose that the search finds, or of the start; None leaves it as it is. A
+    pose that still moves at the end is refined on until it stands still."""
     search_points: int = 1024
     """The search and the verdict use at most this many points of a cloud; larger clouds are
     averaged in voxels."""

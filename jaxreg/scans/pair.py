@@ -35,6 +35,8 @@ _UNLIKE_SIZES = 2.0
 """Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
+_MORE = 200
+"""Further iterations of the refinement for a pose that still moves."""
 _LISTED = 0.01
 """Smallest probability at which a pose is listed among the alternatives."""
 
@@ -66,7 +68,7 @@ class ScanRegistration:
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
     reference's distinct points; NaN if nothing was refined or no surfaces were near each other.
     `weak_directions` are the motions that barely change the fit. `converged` says whether the last
-    step of the refinement was below its tolerance (None: not refined). `dropped` counts the
+    step of the refinement was below its tolerance (None: not refined); if not, it is no success. `dropped` counts the
     non-finite rows of both clouds.
     """
 
@@ -93,6 +95,11 @@ class ScanRegistration:
     def transform(self) -> RigidTransform:
         """Rotation and translation, from source to reference."""
         return RigidTransform(self.rotation, self.translation)
+
+    @property
+    def reach(self) -> float:
+        """`max_correspondence_distance` by its short name."""
+        return self.max_correspondence_distance
 
 
 class Problem(NamedTuple):
@@ -297,7 +304,9 @@ def _refine(problem: Problem, pose: RigidTransform) -> Refined:
     given = config.refine.max_correspondence_distance
     distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
     source, reference, _ = problem.clouds()
-    return refine_indexed(source, reference, initial=pose, distance=distance, config=config.refine)
+    return refine_indexed(
+        source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE
+    )
 
 
 def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistration:
@@ -314,6 +323,7 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
     judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
     chance = 0.0 if verdict.is_free(judged) else float(chances[0])
+    success = chance >= verdict.TRUSTED and refined.converged is not False
     alternatives = tuple(
         Alternative(frame.transform_out(where, other), float(likely))
         for (other, _), likely in zip(found.others, chances[1:], strict=True)
@@ -331,11 +341,9 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
         correspondences=source.per_input_row(
             correspondences + problem.reference.centre, missing=np.nan
         ),
-        success=chance >= verdict.TRUSTED,
+        success=success,
         probability=chance,
-        reason=""
-        if chance >= verdict.TRUSTED
-        else _reason(problem, judged, weak, float(chances[1:].sum())),
+        reason="" if success else _reason(problem, refined, judged, weak, float(chances[1:].sum())),
         overlap=_overlap(problem, refined.transform),
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
@@ -350,14 +358,19 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
 
 
 def _reason(
-    problem: Problem, judged: Evidence, weak: tuple[WeakDirection, ...], rivals: float
+    problem: Problem,
+    refined: Refined,
+    judged: Evidence,
+    weak: tuple[WeakDirection, ...],
+    rivals: float,
 ) -> str:
     """Why the pose is not trusted, and whether the clouds seem to be in different units."""
     source, reference = (c.points * c.radius for c in (problem.source, problem.reference))
     units = diagnosis.compared(source, reference, least=3.0)
+    moving = f"The pose was still moving after {refined.iterations} iterations of the refinement."
     return " ".join(
         [
-            verdict.reason(judged, weak, rivals),
+            moving if refined.converged is False else verdict.reason(judged, weak, rivals),
             *(f"{told[:1].upper()}{told[1:]}." for told in units),
         ]
     )
