@@ -70,6 +70,8 @@ class Register:
     """How to refine the pose that the search found."""
     nonfinite: Literal["raise", "drop"] = "raise"
     """What to do with points that are NaN or infinite."""
+    strays: Literal["drop", "keep", "raise"] = "drop"
+    """What to do with a few points that lie ten times as far from the middle as all others."""
     config: tyro.conf.AvoidSubcommands[RegisterConfig] = RegisterConfig()
     """Settings; the defaults adapt to the data."""
 
@@ -115,6 +117,7 @@ def _registered(
         initial=initial,
         max_rotation_deg=command.max_rotation_deg,
         nonfinite=command.nonfinite,
+        strays=command.strays,
         config=dataclasses.replace(command.config, refine=refinement),
     )
 
@@ -129,6 +132,8 @@ def _print_result(
         line(name, f"{getattr(command, name)} ({told})")
     for name, value in (summary.figures(result) | {"time": f"{seconds:.2f} s"}).items():
         line(name, value.replace("\n", "; "))
+    for note in result.notes:
+        line("note", note)
     say("transformation (source to reference)")
     say(summary.matrix_text(result.transformation))
     line("verdict", summary.verdict_line(result))

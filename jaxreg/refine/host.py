@@ -91,7 +91,9 @@ def refine_indexed(
     """
     check_options(config)
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
-    pose, taken, converged, pairs = iterate(initial, source, reference, weighting, config=config, more=more)
+    pose, taken, converged, pairs = iterate(
+        initial, source, reference, weighting, config=config, more=more
+    )
     # Until here it is orthogonal only to float32.
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)
     # One pair for every point of the source, as in `pose_uncertainty`: in reverse the distances are

@@ -26,7 +26,8 @@ from jaxreg.types import RigidTransform
 _COARSE = 30_000
 """Number of points that find the pose before all of them refine it."""
 _FAR = 2e-3
-"""Steps longer than this (radians, radii of the clouds) lead to a pose that a narrower kernel misses."""
+"""Steps longer than this (radians, radii of the clouds) lead to a pose that a narrower kernel
+misses."""
 _SMALLEST = 512
 """Smallest padded size: below, one more compilation costs more than the padding."""
 
@@ -107,8 +108,8 @@ def iterate(
 
     The kernel narrows to its final width. After a step below `config.tolerance` half of the
     remaining widths are skipped; at the final width all are. Up to `more` further iterations are
-    made where the pose still moves: far at a wide kernel, at all at the final one. Only every `step`-th point looks for a partner; large
-    clouds first converge with fewer.
+    made where the pose still moves: far at a wide kernel, at all at the final one. Only every
+    `step`-th point looks for a partner; large clouds first converge with fewer.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     widths = np.append(widths, np.ones(more, widths.dtype))

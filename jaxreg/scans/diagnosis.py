@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.scans import strays
+
 _SAMPLE = 20_000
 """Points that neighbours are sought for."""
 _UNITS = (
@@ -34,15 +36,19 @@ _UNEVEN = 100.0
 def findings(points: Float[np.ndarray, "n 3"]) -> list[str]:
     """Sentences on one cloud of finite points; none where nothing is odd.
 
-    Coordinates cut to steps, by few digits or by single precision at a large offset; many repeated
-    points; two-dimensional, planar, thin clouds; a density that varies a hundredfold.
+    Strays; of all other points coordinates cut to steps, by few digits or by single precision at a
+    large offset; many repeated points; two-dimensional, planar, thin clouds; a density that varies
+    a hundredfold.
     """
+    far = strays.strays(points)
+    told = [strays.told(points, far)] if far.any() else []
+    points = points[~far]
     distinct = np.unique(points, axis=0)
     if len(distinct) < 3:
         return [f"only {len(distinct)} distinct points: a pose needs 3"]
     repeated = 1 - len(distinct) / len(points)
     near = _neighbours(distinct)
-    told = _steps(distinct, float(np.median(near)), repeated)
+    told += _steps(distinct, float(np.median(near)), repeated)
     if repeated > _REPEATED:
         told.append(f"{repeated:.0%} of the points repeat others: was the file written twice?")
     return [*told, *_shape(distinct), *_density(near)]

@@ -68,8 +68,9 @@ class ScanRegistration:
     `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
     reference's distinct points; NaN if nothing was refined or no surfaces were near each other.
     `weak_directions` are the motions that barely change the fit. `converged` says whether the last
-    step of the refinement was below its tolerance (None: not refined); if not, it is no success. `dropped` counts the
-    non-finite rows of both clouds.
+    step of the refinement was below its tolerance (None: not refined); if not, it is no success.
+    `dropped` counts the rows of both clouds that were left out, because they are not finite or
+    strays; `notes` are sentences on what was odd about the clouds.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -90,6 +91,7 @@ class ScanRegistration:
     evidence: Evidence
     converged: bool | None
     dropped: int
+    notes: tuple[str, ...]
 
     @property
     def transform(self) -> RigidTransform:
@@ -146,6 +148,7 @@ def register(
     initial: object = None,
     max_rotation_deg: float | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
+    strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
 ) -> ScanRegistration:
     """Register two scans: the transform ``y = R x + t`` from source to reference, with a verdict.
@@ -154,7 +157,9 @@ def register(
     order of the points and origin do not matter. `initial` (4x4 or a `RigidTransform`) starts from
     a known pose. The search is skipped, so `alternatives` is empty and the verdict does without
     rival poses. `max_rotation_deg` is the largest rotation to consider (None: any); it decides
-    between the poses of a symmetric shape. The same input gives the same bits.
+    between the poses of a symmetric shape. `nonfinite` and `strays` say what to do with rows that are
+    NaN or infinite, and with a few points that lie ten times as far from the middle as all others.
+    The same input gives the same bits.
 
     Raises:
       ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the
@@ -165,8 +170,8 @@ def register(
     _check_options(max_rotation_deg, config)
     start = None if initial is None else check_pose(initial, "initial")
     problem = pose_problem(
-        _prepared(source, "source", nonfinite, config),
-        _prepared(reference, "reference", nonfinite, config),
+        _prepared(source, "source", nonfinite, strays, config),
+        _prepared(reference, "reference", nonfinite, strays, config),
         config,
     )
     if start is None:
@@ -193,9 +198,9 @@ def _check_options(max_rotation_deg: float | None, config: RegisterConfig) -> No
         )
 
 
-def _prepared(cloud: object, name: str, nonfinite, config: RegisterConfig) -> Prepared:
+def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfig) -> Prepared:
     if not isinstance(cloud, Prepared):
-        return prepare.prepare(cloud, nonfinite=nonfinite, config=config, name=name)
+        return prepare.prepare(cloud, nonfinite=nonfinite, strays=strays, config=config, name=name)
     if cloud.config != config:
         raise ValueError(
             f"{name} was prepared with another configuration than this registration's: give "
@@ -354,6 +359,7 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
         evidence=judged,
         converged=refined.converged,
         dropped=int(np.sum(~source.kept) + np.sum(~problem.reference.kept)),
+        notes=(*source.notes, *problem.reference.notes),
     )
 
 

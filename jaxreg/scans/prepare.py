@@ -20,6 +20,7 @@ from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
+from jaxreg.scans import strays as stray_points
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
@@ -84,9 +85,9 @@ class Prepared:
 
     `points` are the distinct finite points in lexicographic order, around `centre` in units of
     `radius` (root mean square), so order and repetition of the rows, offset and unit do not change
-    a result. `kept` says which rows of the input are finite, and ``points[row]`` are the kept rows
-    in their own order. `fine` and `coarse` have at most `config.refine_points` and
-    `config.search_points` points.
+    a result. `kept` says which rows of the input are finite and no strays, and ``points[row]`` are
+    the kept rows in their own order. `notes` are sentences on what was odd about the cloud. `fine`
+    and `coarse` have at most `config.refine_points` and `config.search_points` points.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -95,6 +96,7 @@ class Prepared:
     radius: float
     kept: Bool[np.ndarray, "n"]
     row: Int[np.ndarray, "r"]
+    notes: tuple[str, ...]
     fine: Level
     coarse: Level
     config: RegisterConfig
@@ -130,32 +132,40 @@ def prepare(
     *,
     normals: object = None,
     nonfinite: Literal["raise", "drop"] = "raise",
+    strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
     name: str = "cloud",
 ) -> Prepared:
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
     `cloud` is array-like (n, 3). `normals` (n, 3), of any length and sign, replace the computed
-    ones; give zeros where unknown. `config` must be that of the registration, and `name` is how
-    messages refer to the cloud.
+    ones; give zeros where unknown. `strays` are a few points ten times as far from the middle as
+    all others (`Prepared.notes` tells of them): they are left out, take part, or are an error;
+    centre and radius are those of the others in any case. `config` must be that of the
+    registration, and `name` is how messages refer to the cloud.
 
     Raises:
       ValueError: the cloud is not a numeric (n, 3) array with at least three finite points (the
-        message names the row), or the normals have another shape or are not finite.
+        message names the row), the normals have another shape or are not finite, or there are strays
+        and `strays` is "raise".
     """
     config = RegisterConfig() if config is None else config
     array, kept = check_points(cloud, name, nonfinite=nonfinite)
     across = None if normals is None else check_normals(normals, kept, name)
+    far, notes = _strays(array[kept], strays, name)
+    if strays == "drop":
+        kept[kept] = ~far
+        far = far[~far]
     points, first, row = _distinct(array[kept])
     across = None if across is None else across[kept][first]
-    centre, radius = frame.measure(points)
+    centre, radius = frame.measure(points[~far[first]])
     points = (points - centre) / (radius or 1.0)
     k = 10 if config.refine is None else config.refine.k
     fine = reduce_to(points, config.refine_points)
     coarse = reduce_to(fine, config.search_points)
     fine, coarse = (_level(level, points, across, k) for level in (fine, coarse))
     return Prepared(
-        points, across, centre, radius or 1.0, kept, row, fine, coarse, config
+        points, across, centre, radius or 1.0, kept, row, notes, fine, coarse, config
     )  # fmt: skip
 
 
@@ -249,6 +259,21 @@ def _describe(points, mask, unit, normals, neighbors, *, radii: tuple[float, ...
         points, mask, unit=unit, normals=normals, neighbors=neighbors,
         config=SearchConfig(radii=radii),
     )  # fmt: skip
+
+
+def _strays(
+    points: np.ndarray, wanted: Literal["drop", "keep", "raise"], name: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Which points are strays, and a sentence on them."""
+    if wanted not in ("drop", "keep", "raise"):
+        raise ValueError(f"strays must be 'drop', 'keep' or 'raise', got {wanted!r}.")
+    far = stray_points.strays(points)
+    if not far.any():
+        return far, ()
+    told = f"{name}: {stray_points.told(points, far)}"
+    if wanted == "raise":
+        raise ValueError(f"{told}: remove them, or pass strays='drop' or strays='keep'.")
+    return far, (f"{told}" + ("; left out" if wanted == "drop" else ""),)
 
 
 def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k: int) -> Level:

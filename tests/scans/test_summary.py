@@ -42,6 +42,7 @@ def result(seed):
         probability=0.25,
         evidence=EVIDENCE,
         dropped=2,
+        notes=(),
     )
 
 

@@ -39,6 +39,7 @@ def registration(source, reference, *, rotation=POSE, translation=(0.0, 0, 0), s
         probability=0.97 if success else 0.03,
         evidence=Evidence(*np.linspace(0.1, 0.9, len(Evidence._fields))),
         dropped=0,
+        notes=(),
     )
 
 
