@@ -16,7 +16,7 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import probabilities
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, diagnosis, prepare, verdict
+from jaxreg.scans import candidates, dense, diagnosis, prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.prepare import Prepared
 from jaxreg.search.config import SearchConfig
@@ -178,7 +178,8 @@ def register(
         found = _search(problem, max_rotation_deg)
     else:
         found = _Found(frame.transform_in(problem.where, start), ())
-    return _result(problem, _refine(problem, found.pose), found)
+    refined = _refine(problem, found.pose)
+    return _result(problem, refined, found, _another_cause(problem, refined.transform))
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}
@@ -314,7 +315,29 @@ def _refine(problem: Problem, pose: RigidTransform) -> Refined:
     )
 
 
-def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistration:
+def _another_cause(problem: Problem, pose: RigidTransform) -> str:
+    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
+    source, reference, length = problem.source, problem.reference, float(problem.where.length)
+    pose = RigidTransform(pose.rotation, pose.translation * length)
+    now = dense.agreement(source, reference, pose)
+    if not now.suspicious:
+        return ""
+    reach = problem.distance * length
+    scale, then = dense.at_another_size(source, reference, pose, reach)
+    if told := dense.size_text(scale, now, then):
+        return told
+    config = problem.config
+    mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
+    twin = pose_problem(mirrored, reference, config)
+    other = _refine(twin, _search(twin, None).pose).transform
+    length = float(twin.where.length)
+    other = RigidTransform(other.rotation, other.translation * length)
+    if dense.agreement(mirrored, reference, other).explains(now):
+        return "The mirrored source fits better."
+    return ""
+
+
+def _result(problem: Problem, refined: Refined, found: _Found, cause: str) -> ScanRegistration:
     source, where = problem.source, problem.where
     length = float(where.length)
     pose = frame.transform_out(where, refined.transform)
@@ -327,7 +350,7 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
     )
     judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
-    chance = 0.0 if verdict.is_free(judged) else float(chances[0])
+    chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
     success = chance >= verdict.TRUSTED and refined.converged is not False
     alternatives = tuple(
         Alternative(frame.transform_out(where, other), float(likely))
@@ -348,7 +371,9 @@ def _result(problem: Problem, refined: Refined, found: _Found) -> ScanRegistrati
         ),
         success=success,
         probability=chance,
-        reason="" if success else _reason(problem, refined, judged, weak, float(chances[1:].sum())),
+        reason=""
+        if success
+        else cause or _reason(problem, refined, judged, weak, float(chances[1:].sum())),
         overlap=_overlap(problem, refined.transform),
         fitness=float(np.mean(inside[source.row])),
         inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
