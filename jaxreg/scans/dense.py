@@ -33,8 +33,11 @@ _ITERATIONS = 30
 
 
 class Agreement(NamedTuple):
-    """`compared`: share of the source's points over a patch of the other surface. `off`: how many of
-    these lie off it by many noise levels."""
+    """How many points of a source lie over the other surface, and how many of these off it.
+
+    `compared` is the share of the points over a patch of the other surface, `off` the share of those
+    that lie many noise levels from it.
+    """
 
     compared: float
     off: float

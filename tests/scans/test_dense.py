@@ -19,7 +19,7 @@ def rng(seed):
 
 
 def plates(rng, n, noise=0.003):
-    """Samples of a plate, a wall at one end of it and two unlike pegs: no symmetry, nor one mirrored."""
+    """Samples of a plate, a wall at one end of it and two unlike pegs: no symmetry."""
     sizes = np.array([[2.0, 1.2, 0.0], [0.0, 1.2, 1.0], [0.3, 0.2, 0.5], [0.5, 0.3, 0.25]])
     corners = np.array([[-1.0, -0.6, 0.0], [-1.0, -0.6, 0.0], [0.3, 0.1, 0.0], [0.2, -0.5, 0.0]])
     which = rng.choice(4, n, p=[0.5, 0.25, 0.12, 0.13])

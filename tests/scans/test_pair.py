@@ -21,6 +21,8 @@ from tests.scenes import angle_deg, assert_proper, moved, pose, revolved, shape
 
 STAIRS, TABLE, CHAIR = 8, 9, 10
 UNREFINED = RegisterConfig(refine=None)
+NARROW = RegisterConfig(wide=None)
+"""For tests to which the wider search, which takes far longer here, is nothing but a second one."""
 
 
 @pytest.fixture
@@ -221,7 +223,7 @@ def test_part_of_the_points_in_common_and_outliers(rng, overlap, outliers):
 
 def test_mirrored_reference_gives_a_rotation(pair):
     """T16."""
-    assert_proper(register(pair[0], pair[0] * [1, 1, -1]).rotation)
+    assert_proper(register(pair[0], pair[0] * [1, 1, -1], config=NARROW).rotation)
 
 
 def test_clouds_without_common_surface_are_no_success():
@@ -235,9 +237,8 @@ def test_clouds_without_common_surface_are_no_success():
         assert not found.success
 
 
-@pytest.mark.xfail(reason="congruent ends fool the verdict: docs/notes/0036 and 0040")
 def test_the_two_sides_of_a_chair_are_no_success():
-    """T14."""
+    """T14: one is the mirror image of the other, and fits better if it is mirrored."""
     cloud = np.concatenate(halves(CHAIR, points=1000))
     assert not register(cloud[cloud[:, 0] < -0.1], cloud[cloud[:, 0] > 0.1]).success
 
@@ -332,7 +333,7 @@ FIXES_NO_POSE = ("line", "three points", "one place", "plane")
 def test_awkward_clouds_give_a_finite_rotation(name):
     """T06: and what fixes no pose is no success."""
     for other in (AWKWARD[name], AWKWARD["ball"][:50]):
-        found = register(AWKWARD[name], other)
+        found = register(AWKWARD[name], other, config=NARROW)
         assert np.isfinite(found.transformation).all()
         assert_proper(found.rotation, 1e-12)
         assert np.isfinite(found.confidence).all()
@@ -425,10 +426,10 @@ def test_sizes_in_one_bucket_compile_once(pair):
 
 def test_units_that_differ_beyond_single_precision(pair):
     for scale in (1e98, 1e-98):
-        result = register(np.ones((3, 3)), scale * np.array([[1.0, 2, 3]] * 3))
+        result = register(np.ones((3, 3)), scale * np.array([[1.0, 2, 3]] * 3), config=NARROW)
         assert np.isfinite(result.transformation).all()
         assert not result.success
-        assert np.isfinite(register(pair[0], scale * pair[1]).transformation).all()
+        assert np.isfinite(register(pair[0], scale * pair[1], config=NARROW).transformation).all()
 
 
 def counted(monkeypatch, module, name, calls):

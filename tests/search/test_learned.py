@@ -51,6 +51,7 @@ def test_motion_order_and_padding_do_not_matter(problem, seed):
     assert np.quantile(np.abs(there[:N, :N] - here[:N, :N][order]), 0.99) < 5e-3
 
 
+@pytest.mark.slow
 def test_weights_have_finite_gradients_that_descend(problem, seed):
     """A law of gradients: a short step along minus the gradient lowers what was differentiated."""
     network, x, y = problem

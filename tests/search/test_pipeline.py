@@ -104,6 +104,7 @@ def test_derivatives_are_finite_and_do_not_see_padding(seed):
     assert np.all(gradient[380:] == 0)
 
 
+@pytest.mark.slow
 def test_large_clouds_end():
     """With LAPACK's eigenvectors of every point the second call waited forever on two cores.
 

@@ -1,5 +1,6 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import rigid
@@ -68,6 +69,7 @@ def test_padding_counts_for_nothing():
     )
 
 
+@pytest.mark.slow
 def test_grids_give_about_the_same_terms_and_every_other_point_is_enough(seed):
     rng = np.random.default_rng(seed)
     source, reference = plane(0.0, 0.05), plane(0.0, 0.1, local=(0.8, 0.6))

@@ -90,6 +90,7 @@ def test_a_pose_that_no_match_leads_to_can_be_given(boxes):
     assert min(angle_deg(rotation, turn) for rotation in found.poses.rotation) < 5
 
 
+@pytest.mark.slow
 def test_a_network_matches_points_by_its_features(seed):
     """The search is that of the cosines of its features, and not that of the moments."""
     source, reference, _ = make_pair(seed)

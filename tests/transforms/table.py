@@ -17,6 +17,17 @@ from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.refine_rows import refine_rows
 from tests.transforms.search_rows import search_rows
 
+WHOLE = (
+    "network.losses.step_losses",
+    "network.model.iterate",
+    "refine.methods.refine",
+    "search.pipeline.register_global",
+    "search.pipeline.search_poses",
+    "search.stages.search_described",
+)
+"""Whole programs that take long to compile, or long one operation at a time, and whose parts are rows
+of their own: what `make test` leaves out, `make slow` runs."""
+
 TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows() | judge_rows()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from tests.compiled import AS_USERS
 from tests.transforms.rows import Row
-from tests.transforms.table import TABLE, is_float, rows
+from tests.transforms.table import TABLE, WHOLE, is_float, rows
 
 
 def floating(row: Row, inputs: tuple):
@@ -72,12 +72,7 @@ def derivatives(name, row, inputs, rng):
 DIFFERENTIABLE = sorted(name for name, row in TABLE.items() if row.generic)
 
 
-WHOLE_SEARCHES = [
-    name for name in DIFFERENTIABLE if name.startswith(("search.pipe", "search.stag"))
-]
-
-
-@rows(DIFFERENTIABLE, slow=WHOLE_SEARCHES)
+@rows(DIFFERENTIABLE, slow=WHOLE)
 def test_derivatives_at_generic_inputs(name, row, seed):
     rng = np.random.default_rng(seed)
     _, tangent, gradient, at, products = derivatives(name, row, row.generic, rng)

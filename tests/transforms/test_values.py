@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.transforms.table import TABLE, is_float, rows
+from tests.transforms.table import TABLE, WHOLE, is_float, rows
 
-each_row = rows(sorted(name for name, row in TABLE.items() if row.generic and not row.parts))
+PLAIN = sorted(name for name, row in TABLE.items() if row.generic and not row.parts)
 
 
 def assert_close(a, b, tolerance):
@@ -29,13 +29,13 @@ def jitted(name: str) -> Callable:
     return jax.jit(TABLE[name].function)
 
 
-@each_row
+@rows(PLAIN, slow=WHOLE)
 def test_jit_equals_eager(name, row):
     for inputs in (row.generic, *row.degenerate[:1]):
         assert_close(jitted(name)(*inputs), row.function(*arrays(inputs)), row.rounding)
 
 
-@each_row
+@rows(PLAIN, slow=set(WHOLE) - {"search.pipeline.register_global"})
 def test_vmap_equals_a_loop(name, row):
     leaves, tree = jax.tree.flatten(row.generic)
     batch = [
