@@ -1,4 +1,4 @@
-"""Symmetric 3x3 matrices, many at a time: eigenvectors and the inverse, elementwise.
+"""Symmetric 3x3 matrices, many at a time: eigenvectors and inverses, elementwise.
 
 A cloud has one such matrix per point. LAPACK takes them one by one, and on clouds of more than
 about 1500 points its calls have hung, waiting for XLA's thread pool (jaxlib 0.10.2, two cores).
@@ -68,6 +68,32 @@ def inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     determinant = jnp.sum(a * cofactors[..., :, 0], axis=-1)
     return cofactors / determinant[..., None, None]
+
+
+@jax.custom_jvp
+def pseudo_inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
+    """``P`` with ``P A`` the projector onto the eigenvectors that count (Moore and Penrose).
+
+    Those count whose eigenvalues are larger than rounding: 16 last digits of the largest, in size.
+    Differentiable to every order where their number does not change (Golub and Pereyra, 1973):
+    ``dP = -P dA P + P P dA (I - A P) + (I - P A) dA P P``.
+    """
+    values, vectors = eigh(matrix)
+    size = jnp.abs(values)
+    rounding = 16 * jnp.finfo(size.dtype).eps * jnp.max(size, axis=-1, keepdims=True)
+    counts = size > rounding
+    inverted = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
+    return _product(vectors * inverted[..., None, :], vectors.mT)
+
+
+@pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(primals, tangents):
+    (matrix,), (change,) = primals, tangents
+    found = pseudo_inverse(matrix)
+    rest = jnp.eye(3, dtype=matrix.dtype) - _product(matrix, found)
+    outward = _product(_product(_product(found, found), change), rest)
+    through = _product(_product(found, change), found)
+    return found, outward + outward.mT - through
 
 
 def _product(a: Array, b: Array) -> Array:
