@@ -74,6 +74,7 @@ def inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
 def pseudo_inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
     """``P`` with ``P A`` the projector onto the eigenvectors that count (Moore and Penrose).
 
+    A is the symmetric part of `matrix`.
     Those count whose eigenvalues are larger than rounding: 16 last digits of the largest, in size.
     Differentiable to every order where their number does not change (Golub and Pereyra, 1973):
     ``dP = -P dA P + P P dA (I - A P) + (I - P A) dA P P``.
@@ -88,7 +89,7 @@ def pseudo_inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
 
 @pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(primals, tangents):
-    (matrix,), (change,) = primals, tangents
+    matrix, change = ((x[0] + x[0].mT) / 2 for x in (primals, tangents))
     found = pseudo_inverse(matrix)
     rest = jnp.eye(3, dtype=matrix.dtype) - _product(matrix, found)
     outward = _product(_product(_product(found, found), change), rest)
