@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
+from jaxreg._xla import varying_like
+
 _SWEEPS = 5
 """Sweeps of Jacobi rotations. The convergence is quadratic: after four, a million matrices, some of
 them nearly singular or with equal eigenvalues, are diagonal to the rounding of float64."""
@@ -39,8 +41,8 @@ def eigh(matrix: Float[Array, "*n 3 3"]) -> Eigen:
     entry = lambda p, q: (matrix[..., p, q] / scale)[None]  # noqa: E731
     diagonal, off = (tuple(entry(k, (k + d) % 3) for k in range(3)) for d in (0, 1))
     unit = jnp.eye(3, dtype=matrix.dtype)
-    shape = (3, *scale.shape)
-    columns = tuple(jnp.broadcast_to(jnp.expand_dims(e, range(1, len(shape))), shape) for e in unit)
+    wide = range(1, 1 + scale.ndim)
+    columns = tuple(varying_like(jnp.expand_dims(e, wide), scale[None]) for e in unit)
     state = jax.lax.fori_loop(0, 3 * _SWEEPS, _rotate, (diagonal, off, columns))
     pairs = list(zip(state[0], state[2], strict=True))
     for lower, upper in ((0, 1), (1, 2), (0, 1)):

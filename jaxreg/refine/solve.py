@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import varying_like
 from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.small_linear import singular_vectors
@@ -86,7 +87,9 @@ def _iterate(
 
     dtype = problem.scene.source.dtype
     widths = jnp.asarray(widenings(config.iterations, config.kernel_annealing, dtype))
-    pose, changes = jax.lax.scan(step, problem.start, widths)
+    rotation, shift = problem.start
+    start = RigidTransform(varying_like(rotation, shift[0]), shift)
+    pose, changes = jax.lax.scan(step, start, widths)
     return pose, changes[-1]
 
 
