@@ -72,3 +72,12 @@ def unfused(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     precision = jnp.finfo(x.dtype)
     return jax.lax.reduce_precision(x, precision.nexp, precision.nmant)
+
+
+def varying_like(x: Shaped[Array, "..."], like: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
+    """`x`, broadcast against `like`, and as different on the devices of a mesh as `like` is.
+
+    Under `jax.shard_map` a loop whose state begins with a constant, the same everywhere, must not end
+    with a state that differs. The choice between `x` and `x` is nothing to compute.
+    """
+    return jnp.where(jax.lax.stop_gradient(like) == 0, x, x)

@@ -7,6 +7,7 @@ degrees. Lengths have the unit of the input.
 
 from typing import Any, NamedTuple
 
+from jax import export
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -112,3 +113,8 @@ class Refinement(NamedTuple):
     def transform(self) -> RigidTransform:
         """The pose alone."""
         return RigidTransform(self.rotation, self.translation)
+
+
+# What returns a record can be saved as a program (`jax.export`).
+for _record in (RigidTransform, PointCloud, Pair, Registration, GlobalRegistration, Refinement):
+    export.register_namedtuple_serialization(_record, serialized_name=f"jaxreg.{_record.__name__}")

@@ -1,4 +1,4 @@
-"""Symmetric 3x3 matrices, many at a time: eigenvectors and the inverse, elementwise.
+"""Symmetric 3x3 matrices, many at a time: eigenvectors and inverses, elementwise.
 
 A cloud has one such matrix per point. LAPACK takes them one by one, and on clouds of more than
 about 1500 points its calls have hung, waiting for XLA's thread pool (jaxlib 0.10.2, two cores).
@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
+
+from jaxreg._xla import varying_like
 
 _SWEEPS = 5
 """Sweeps of Jacobi rotations. The convergence is quadratic: after four, a million matrices, some of
@@ -39,8 +41,8 @@ def eigh(matrix: Float[Array, "*n 3 3"]) -> Eigen:
     entry = lambda p, q: (matrix[..., p, q] / scale)[None]  # noqa: E731
     diagonal, off = (tuple(entry(k, (k + d) % 3) for k in range(3)) for d in (0, 1))
     unit = jnp.eye(3, dtype=matrix.dtype)
-    shape = (3, *scale.shape)
-    columns = tuple(jnp.broadcast_to(jnp.expand_dims(e, range(1, len(shape))), shape) for e in unit)
+    wide = range(1, 1 + scale.ndim)
+    columns = tuple(varying_like(jnp.expand_dims(e, wide), scale[None]) for e in unit)
     state = jax.lax.fori_loop(0, 3 * _SWEEPS, _rotate, (diagonal, off, columns))
     pairs = list(zip(state[0], state[2], strict=True))
     for lower, upper in ((0, 1), (1, 2), (0, 1)):
@@ -68,6 +70,33 @@ def inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
     cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
     determinant = jnp.sum(a * cofactors[..., :, 0], axis=-1)
     return cofactors / determinant[..., None, None]
+
+
+@jax.custom_jvp
+def pseudo_inverse(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
+    """``P`` with ``P A`` the projector onto the eigenvectors that count (Moore and Penrose).
+
+    A is the symmetric part of `matrix`.
+    Those count whose eigenvalues are larger than rounding: 16 last digits of the largest, in size.
+    Differentiable to every order where their number does not change (Golub and Pereyra, 1973):
+    ``dP = -P dA P + P P dA (I - A P) + (I - P A) dA P P``.
+    """
+    values, vectors = eigh(matrix)
+    size = jnp.abs(values)
+    rounding = 16 * jnp.finfo(size.dtype).eps * jnp.max(size, axis=-1, keepdims=True)
+    counts = size > rounding
+    inverted = jnp.where(counts, 1 / jnp.where(counts, values, 1), 0)
+    return _product(vectors * inverted[..., None, :], vectors.mT)
+
+
+@pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(primals, tangents):
+    matrix, change = ((x[0] + x[0].mT) / 2 for x in (primals, tangents))
+    found = pseudo_inverse(matrix)
+    rest = jnp.eye(3, dtype=matrix.dtype) - _product(matrix, found)
+    outward = _product(_product(_product(found, found), change), rest)
+    through = _product(_product(found, change), found)
+    return found, outward + outward.mT - through
 
 
 def _product(a: Array, b: Array) -> Array:

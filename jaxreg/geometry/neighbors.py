@@ -4,6 +4,8 @@ The product form ``|x|^2 - 2 x.y + |y|^2`` is not used for points: a thousand un
 origin it gives the wrong neighbour half of the time.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -64,12 +66,7 @@ def knn(
         negative, column = jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
         return jnp.where(jnp.isneginf(negative), row[:, None], order[column])
 
-    if n <= _BLOCK:
-        index = of_rows(row)
-    else:
-        # Rows in blocks, because all distances of a large cloud at once would fill the memory.
-        blocks = jnp.pad(row, (0, -n % _BLOCK)).reshape(-1, _BLOCK)
-        index = jax.lax.map(of_rows, blocks).reshape(-1, k)[:n]
+    index = _in_blocks(of_rows, row)
     # The barrier keeps XLA from merging later slices into the selection, which would turn the
     # fast call into a full sort of every row.
     return jax.lax.optimization_barrier(index.astype(jnp.int32))
@@ -96,6 +93,25 @@ def nearest_in(
     It is the first of those that are equally near, up to rounding.
     """
     points, others = jax.lax.stop_gradient((points, without_padding(others, mask)))
+    return _in_blocks(lambda rows: _nearest_of(rows, others, mask), points)
+
+
+def _in_blocks(of_rows: Callable[[Array], Array], rows: Array) -> Array:
+    """``of_rows(rows)``, of a block of rows after the other if there are many.
+
+    All distances of a large cloud at once would fill the memory.
+    """
+    n = rows.shape[0]
+    if n <= _BLOCK:
+        return of_rows(rows)
+    padded = jnp.pad(rows, ((0, -n % _BLOCK), *[(0, 0)] * (rows.ndim - 1)))
+    found = jax.lax.map(of_rows, padded.reshape(-1, _BLOCK, *rows.shape[1:]))
+    return found.reshape(-1, *found.shape[2:])[:n]
+
+
+def _nearest_of(
+    points: Float[Array, "n 3"], others: Float[Array, "m 3"], mask: Bool[Array, "m"] | None
+) -> Int[Array, "n"]:
     distance = squared_distances(points, others)
     if mask is not None:
         distance = jnp.where(mask[None, :], distance, jnp.inf)

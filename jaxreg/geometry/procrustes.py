@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
+from jaxreg.geometry.eigen3x3 import pseudo_inverse
+from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.types import RigidTransform
 
 
@@ -105,11 +107,28 @@ def special_procrustes(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
 @jax.custom_jvp
 def _rotation(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    u, _, vt = jnp.linalg.svd(covariance)
-    sign = jnp.linalg.det(jnp.matmul(vt.T, u.T, precision=Precision.HIGHEST))
-    signs = jnp.stack([jnp.ones_like(sign), jnp.ones_like(sign), jnp.sign(sign)])
-    rotation = jnp.matmul(vt.T * signs[None, :], u.T, precision=Precision.HIGHEST)
-    # One Newton step towards the nearest orthogonal matrix: float32 factors are orthogonal to
+    """By the unit quaternion q that maximises ``q^T N q`` = trace(R H) (Horn, 1987).
+
+    N is symmetric and 4x4. Its eigenvalues are sums of three singular values of H with signs, so a
+    multiple of the identity makes it positive semi-definite. With H = 0 every q is as good as
+    another, and the rotations leave the first one: the identity.
+    """
+    across = covariance - covariance.T
+    trace = jnp.trace(covariance)
+    unit = jnp.eye(3, dtype=covariance.dtype)
+    axial = jnp.stack([across[1, 2], across[2, 0], across[0, 1]])
+    horn = jnp.block(
+        [[trace[None, None], axial[None, :]],
+         [axial[:, None], covariance + covariance.T - trace * unit]]
+    )  # fmt: skip
+    shift = jnp.sqrt(3 * jnp.sum(covariance**2))
+    scaled, vectors = singular_vectors(horn + shift * jnp.eye(4, dtype=horn.dtype))
+    w, x, y, z = q = vectors[:, jnp.argmax(jnp.sum(scaled**2, axis=0))]
+    zero = jnp.zeros_like(w)
+    turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    left, right = (jnp.concatenate([-q[1:, None], w * unit + t], axis=1) for t in (turn, -turn))
+    rotation = jnp.matmul(left, right.T, precision=Precision.HIGHEST)
+    # One Newton step towards the nearest orthogonal matrix: float32 rotations are orthogonal to
     # 1e-6 only, which a chain of iterations would add up.
     gram = jnp.matmul(rotation.T, rotation, precision=Precision.HIGHEST)
     return jnp.matmul(
@@ -134,7 +153,5 @@ def _rotation_jvp(primals, tangents):
     skew = jnp.matmul(rotation, covariance_dot, precision=Precision.HIGHEST)
     skew = skew.T - skew
     axial = jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
-    tolerance = 16 * jnp.finfo(a.dtype).eps
-    inverse = jnp.linalg.pinv(system, rtol=tolerance, hermitian=True)
-    omega = jnp.matmul(inverse, axial, precision=Precision.HIGHEST)
+    omega = jnp.matmul(pseudo_inverse(system), axial, precision=Precision.HIGHEST)
     return rotation, jnp.cross(omega[None, :], rotation.T).T

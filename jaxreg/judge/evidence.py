@@ -14,6 +14,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry.numerics import safe_sqrt
+from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.judge.surface import Examined, every
 from jaxreg.types import RigidTransform
 
@@ -194,13 +195,4 @@ def _held(
     rows = rows * weight[:, None]
     mean = jnp.matmul(rows.T, rows, precision=Precision.HIGHEST) / count
     damped = mean + _LEAST * jnp.eye(6, dtype=points.dtype)
-    return 6 / jnp.trace(_inverse(damped)) - _LEAST
-
-
-def _inverse(matrix: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """Of a positive definite matrix, by Gauss-Jordan elimination without pivots."""
-    rows = jnp.concatenate([matrix, jnp.eye(6, dtype=matrix.dtype)], axis=1)
-    for k in range(6):
-        pivot = rows[k] / rows[k, k]
-        rows = (rows - rows[:, k][:, None] * pivot[None, :]).at[k].set(pivot)
-    return rows[:, 6:]
+    return 6 / jnp.trace(inverse_definite(damped)) - _LEAST

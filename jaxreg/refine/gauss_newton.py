@@ -11,6 +11,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Float
 
 from jaxreg.geometry.numerics import safe_norm
+from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.types import RigidTransform
 
 _DAMPING = 1e-5
@@ -68,7 +69,7 @@ def solve_damped(
     mean = jnp.trace(information) / 6
     scale = jnp.where(mean > 0, mean, 1)
     damped = information / scale + _DAMPING * jnp.eye(6, dtype=information.dtype)
-    return jnp.linalg.solve(damped, gradient / scale)
+    return jnp.matmul(inverse_definite(damped), gradient / scale, precision=Precision.HIGHEST)
 
 
 def update_left(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import varying_like
 from jaxreg.refine.config import Kernel
 
 _SMALLEST_SCALE = 1e-3
@@ -151,7 +152,8 @@ def masked_quantile(
         return jnp.where(jnp.sum(bits < larger, dtype=jnp.int32) < rank, larger, found)
 
     # The sign bit is 0.
-    found = jax.lax.fori_loop(1, high + 1, step, jnp.zeros((), integer))
+    first = varying_like(jnp.zeros((), integer), values[0])
+    found = jax.lax.fori_loop(1, high + 1, step, first)
     # The nearest one, because XLA may have computed the values again, with another last bit.
     apart = jnp.maximum(bits, found) - jnp.minimum(bits, found)
     return jnp.where(count > 0, values[jnp.argmin(apart)], 0)

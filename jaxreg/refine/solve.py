@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import varying_like
 from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.numerics import safe_sqrt
+from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.refine.config import RefineConfig, check_options
 from jaxreg.refine.correspondences import Pairs, closest_pairs, with_neighbors
 from jaxreg.refine.cost import Method, Scene, match
@@ -85,7 +87,9 @@ def _iterate(
 
     dtype = problem.scene.source.dtype
     widths = jnp.asarray(widenings(config.iterations, config.kernel_annealing, dtype))
-    pose, changes = jax.lax.scan(step, problem.start, widths)
+    rotation, shift = problem.start
+    start = RigidTransform(varying_like(rotation, shift[0]), shift)
+    pose, changes = jax.lax.scan(step, start, widths)
     return pose, changes[-1]
 
 
@@ -141,12 +145,13 @@ def _inverse_and_rest(
     matrix: Float[Array, "6 6"],
 ) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
     """The inverse on what `matrix` acts upon, and the projector onto the rest."""
-    left, values, right = jnp.linalg.svd(matrix)
-    acts = values > _LEAST_PULL
-    inverted = jnp.where(acts, 1 / jnp.where(acts, values, 1), 0)
-    inverse = jnp.matmul(right.T * inverted[None, :], left.T, precision=Precision.HIGHEST)
-    rest = right * jnp.where(acts, 0, 1).astype(matrix.dtype)[:, None]
-    return inverse, jnp.matmul(right.T, rest, precision=Precision.HIGHEST)
+    scaled, right = singular_vectors(matrix)
+    squared = jnp.sum(scaled**2, axis=0)
+    acts = squared > _LEAST_PULL**2
+    inverted = jnp.where(acts, 1 / jnp.where(acts, squared, 1), 0)
+    inverse = jnp.matmul(right * inverted[None, :], scaled.T, precision=Precision.HIGHEST)
+    rest = right * jnp.where(acts, 0, 1).astype(matrix.dtype)[None, :]
+    return inverse, jnp.matmul(rest, right.T, precision=Precision.HIGHEST)
 
 
 def _held(problem: Problem) -> Problem:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg.geometry import frame, rigid
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
+from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs, closest_pairs
 from jaxreg.refine.cost import Scene, match
@@ -277,9 +278,11 @@ def _bounded_inverse_jvp(primals, tangents):
 
 
 def _raised_eigenvalues(information: Float[Array, "6 6"]):
-    values, vectors = jnp.linalg.eigh(information)
-    floor = _SMALLEST_EIGENVALUE * values[-1]
-    return values, jnp.where(values[-1] > 0, jnp.maximum(values, floor), 1), vectors
+    scaled, vectors = singular_vectors(information)
+    values = jnp.sum(vectors * scaled, axis=0)
+    largest = jnp.max(values)
+    raised = jnp.maximum(values, _SMALLEST_EIGENVALUE * largest)
+    return values, jnp.where(largest > 0, raised, 1), vectors
 
 
 def _upright(axis: np.ndarray) -> np.ndarray:

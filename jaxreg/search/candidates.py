@@ -75,6 +75,9 @@ def select_candidates(
 
 def _best(similarity: Array, matches: int) -> tuple[Array, Array]:
     """Values of the best ``matches + 1`` of every row, and the columns of the best `matches`."""
-    # The barrier keeps XLA from turning the selection into a full sort when it is sliced.
-    values, index = jax.lax.optimization_barrier(jax.lax.top_k(similarity, matches + 1))
-    return values, index[:, :matches]
+    _, index = jax.lax.top_k(similarity, matches + 1)
+    # The barrier keeps XLA from turning the selection into a full sort when it is sliced. Around the
+    # pair that `top_k` returns it would abort the process under `jax.pmap` and `jax.shard_map`
+    # (jaxlib 0.10.2), so the values are read again.
+    index = jax.lax.optimization_barrier(index)
+    return jnp.take_along_axis(similarity, index, axis=1), index[:, :matches]

@@ -48,7 +48,10 @@ def pose_hypotheses(
     most others: when nine in ten are wrong, that loses the right ones.
     """
     among = second_order(first, seeds)
-    _, members = jax.lax.optimization_barrier(jax.lax.top_k(among, consensus_size))
+    _, members = jax.lax.top_k(among, consensus_size)
+    # Keeps XLA from making the selection a full sort. Around the pair that `top_k` returns it would
+    # abort the process under `jax.pmap` and `jax.shard_map` (jaxlib 0.10.2).
+    members = jax.lax.optimization_barrier(members)
     own = jnp.arange(seeds, dtype=members.dtype)[:, None]
     members = jnp.concatenate([own, members], axis=1)
     local = first[members[:, :, None], members[:, None, :]]

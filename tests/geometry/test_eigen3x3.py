@@ -80,3 +80,31 @@ def test_derivative_of_a_smooth_function_is_right_at_equal_eigenvalues():
 def test_inverse_of_symmetric_matrices(seed):
     matrix = matrices(seed, np.random.default_rng(seed).uniform(0.1, 1, (5, 3)))
     np.testing.assert_allclose(eigen3x3.inverse(jnp.asarray(matrix)), np.linalg.inv(matrix))
+
+
+def test_pseudo_inverse_is_that_of_numpy(seed):
+    for rank, values in enumerate(np.tril(np.array([2.0, -1.0, 0.5])[None].repeat(4, 0), -1)):
+        (matrix,) = matrices(seed + rank, values[None])
+        found = jax.jit(eigen3x3.pseudo_inverse)(jnp.asarray(matrix))
+        expected = np.linalg.pinv(matrix, rcond=1e-12, hermitian=True)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [(1.0, 2, 4), (1, 1, 1), (-1, 1, 1)])
+def test_derivatives_of_the_pseudo_inverse_equal_finite_differences(seed, values):
+    (matrix,) = matrices(seed, np.array([values], float))
+    check_grads(
+        jax.jit(eigen3x3.pseudo_inverse), (matrix,), order=2, modes=("fwd", "rev"), rtol=1e-4
+    )
+
+
+def test_derivative_of_the_pseudo_inverse_where_the_rank_stays(seed):
+    """``A = B D B^T`` for any B has the rank of D; the differences are numpy's."""
+    (basis,) = matrices(seed, np.array([[1.0, 2, 3]]))
+    change = np.random.default_rng(seed).normal(size=(3, 3))
+    of = lambda x: (basis + x * change) @ np.diag([1.0, 2, 0]) @ (basis + x * change).T  # noqa: E731
+    turning = change @ np.diag([1.0, 2, 0]) @ basis.T
+    point, direction = jnp.asarray(of(0.0)), jnp.asarray(turning + turning.T)
+    found = jax.jvp(jax.jit(eigen3x3.pseudo_inverse), (point,), (direction,))[1]
+    ahead, behind = (np.linalg.pinv(of(x), rcond=1e-9, hermitian=True) for x in (1e-6, -1e-6))
+    np.testing.assert_allclose(found, (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-6)

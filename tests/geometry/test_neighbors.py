@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from jaxreg.geometry import neighbors
 from tests import oracles
@@ -109,6 +110,15 @@ def test_nearest_in_another_cloud(rng):
     expected = [np.argmin([np.sum((p - q) ** 2) for q in others[:7]]) for p in points]
     others[7:] = np.nan
     np.testing.assert_array_equal(nearest_in(points, others, mask), expected)
+
+
+def test_large_clouds_are_searched_in_blocks_of_rows(rng):
+    points, others = rng.normal(size=(2100, 3)), rng.normal(size=(40, 3))
+    _, expected = cKDTree(others).query(points)
+    np.testing.assert_array_equal(nearest_in(points, others), expected)
+    cloud = jax.ShapeDtypeStruct((16_384, 3), np.float32)
+    needed = nearest_in.lower(cloud, cloud).compile().memory_analysis().temp_size_in_bytes
+    assert needed < 16_384**2 * 4 / 2
 
 
 def test_squared_distances_entry_by_entry(rng):

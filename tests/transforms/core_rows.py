@@ -70,6 +70,7 @@ def core_rows() -> dict[str, Row]:
             tuple((m,) for m in (np.zeros((3, 3)), np.eye(3), np.ones((3, 3)))),
         ),
         "geometry.eigen3x3.inverse": Row(eigen3x3.inverse, (tilted,)),
+        "geometry.eigen3x3.pseudo_inverse": Row(eigen3x3.pseudo_inverse, (tilted,)),
         "geometry.rigid.identity": Row(lambda: rigid.identity(jnp.float64), ()),
         "geometry.rigid.apply": Row(
             rigid.apply, (pose(), points()), ((nowhere(), np.zeros((N, 3))),)
