@@ -58,6 +58,7 @@ def test_fixed_point_minimises_the_mahalanobis_distances(seed):
     np.testing.assert_allclose(best.x, 0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_edges_stop_a_plate_from_sliding(seed):
     """Planes see little of a slide along them; the edges of two samplings of a plate do."""
     rng = np.random.default_rng(seed)

@@ -226,6 +226,7 @@ def test_mirrored_reference_gives_a_rotation(pair):
     assert_proper(register(pair[0], pair[0] * [1, 1, -1], config=NARROW).rotation)
 
 
+@pytest.mark.slow
 def test_clouds_without_common_surface_are_no_success():
     """T14."""
     for source, reference in (
@@ -281,6 +282,7 @@ def test_limited_rotation_is_kept(pair):
         assert angle_deg(other.transform.rotation, np.eye(3)) < 80.5
 
 
+@pytest.mark.slow
 def test_limited_rotation_is_kept_where_all_rotations_fit(seed):
     """A vase looks alike from everywhere: of some two dozen distinct poses one is within bounds."""
     rng = np.random.default_rng(seed)
