@@ -4,6 +4,7 @@ import contextlib
 import os
 from typing import Literal
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -82,6 +83,11 @@ def _as_floats(points: object, name: str) -> np.ndarray:
     if isinstance(points, str | os.PathLike):
         raise ValueError(
             f"{name} is {str(points)!r}: give its points, as jaxreg.read_cloud({str(points)!r}) reads."
+        )
+    if isinstance(points, jax.core.Tracer):
+        raise ValueError(
+            f"{name} is traced, but this function runs on the host: under jit, grad or vmap use "
+            "jaxreg.register_global, or jaxreg.gicp from a start."
         )
     try:
         array = np.asarray(points)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import rigid
+from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import without_padding
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.types import RigidTransform
@@ -38,9 +38,12 @@ def enter(
     the clouds are swapped; it is 1 if every point coincides with the centroid.
 
     Raises:
-      ValueError: a cloud is not ``(n, 3)`` or has no row.
+      ValueError: a cloud is not ``(n, 3)`` or has no row, a mask is not ``(n,)`` of bools, or their
+        dtypes are not one of float32 and float64.
     """
-    check_clouds(source, reference)
+    source, reference = arguments.clouds(source, reference)
+    source_mask = arguments.mask("source_mask", source_mask, source.shape[0])
+    reference_mask = arguments.mask("reference_mask", reference_mask, reference.shape[0])
     source, source_centre = _centred(source, source_mask)
     reference, reference_centre = _centred(reference, reference_mask)
     variance = _mean_square(source, source_mask) + _mean_square(reference, reference_mask)
@@ -79,16 +82,6 @@ def measure(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], f
         return centre, 0.0
     mean_square = sum(float(np.mean((column / largest) ** 2)) for column in columns)
     return centre, largest * mean_square**0.5
-
-
-def check_clouds(source: Array, reference: Array) -> None:
-    """Raises ValueError unless both clouds are ``(n, 3)`` with at least one row."""
-    for name, points in (("source", source), ("reference", reference)):
-        if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
-            raise ValueError(
-                f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, "
-                "and use jax.vmap for a batch."
-            )
 
 
 def _rotated(transform: RigidTransform, frame: Frame):

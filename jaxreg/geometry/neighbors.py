@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._xla import row_min
+from jaxreg.geometry import arguments
 
 _BLOCK = 2048
 """Points whose distances to all others are in memory at once."""
@@ -45,16 +46,18 @@ def knn(
     with fewer than `k` valid others fills its list up with itself.
 
     Raises:
-      ValueError: `points` is not ``(n, 3)``, or not ``1 <= k < n``.
+      ValueError: `points` is not ``(n, 3)`` of float32 or float64, `mask` not ``(n,)`` of bools, or
+        not ``1 <= k < n``.
     """
-    _check_points(points)
+    points = arguments.cloud("points", points)
     n = points.shape[0]
+    mask, k = arguments.mask("mask", mask, n), arguments.count("k", k)
     if not 1 <= k < n:
         raise ValueError(
             f"k = {k} neighbours in a cloud of n = {n} points: "
             "choose 1 <= k < n, or give more points."
         )
-    points = jax.lax.stop_gradient(without_padding(jnp.asarray(points), mask))
+    points = jax.lax.stop_gradient(without_padding(points, mask))
     order = _scattered(points)
     candidates, row = points[order], jnp.arange(n, dtype=order.dtype)
 
@@ -78,7 +81,7 @@ def nearest_neighbor(
     """Index of the nearest other point: ``points[idx]`` is the 1-NN cloud (Eq. 1-2, i != m).
 
     Raises:
-      ValueError: `points` is not ``(n, 3)``, or has fewer than two rows.
+      ValueError: what `knn` raises; `points` needs two rows.
     """
     return knn(points, 1, mask)[:, 0]
 
@@ -141,11 +144,3 @@ def _scattered(points: Float[Array, "n 3"]) -> Int[Array, "n"]:
         mixed = (mixed ^ bits[:, axis]) * odd
         mixed = mixed ^ (mixed >> (width // 2))  # The low bits of round numbers are all zero.
     return jnp.lexsort((*points.T, mixed))
-
-
-def _check_points(points: Array) -> None:
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(
-            f"points must have shape (n, 3), got {points.shape}: give one cloud, "
-            "and use jax.vmap for a batch."
-        )

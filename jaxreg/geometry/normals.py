@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.geometry import eigen3x3
+from jaxreg.geometry import arguments, eigen3x3
 from jaxreg.geometry.neighbors import without_padding
 from jaxreg.geometry.numerics import safe_norm
 
@@ -24,6 +24,9 @@ def neighborhood_covariances(
 
     `neighbors` are rows of `points`, as `jaxreg.knn` gives them; a point that fills its own list
     counts once. Padded rows give zero.
+
+    Raises:
+      ValueError: a shape or a dtype is wrong; the message names the argument.
     """
     offsets, weight = _offsets(points, neighbors, mask)
     total = jnp.maximum(jnp.sum(weight, axis=1), 1)
@@ -34,6 +37,9 @@ def neighborhood_covariances(
 
 def _offsets(points, neighbors, mask) -> tuple[Array, Array]:
     """Offsets from every point to itself and its neighbours (n, k + 1, 3); 1 if one counts, else 0."""
+    points = arguments.cloud("points", points)
+    neighbors = arguments.indices("neighbors", neighbors, points.shape[0])
+    mask = arguments.mask("mask", mask, points.shape[0])
     points = without_padding(points, mask)
     own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
     counts = jnp.concatenate([jnp.ones_like(own, bool), neighbors != own], axis=1)
@@ -54,6 +60,9 @@ def normals(
 
     Differentiable, with the derivative of the eigenvector where there is a normal and 0 elsewhere:
     the gap of the eigenvalues that it divides by is bounded away from zero.
+
+    Raises:
+      ValueError: a shape or a dtype is wrong; the message names the argument.
     """
     return smallest_eigenvector(neighborhood_covariances(points, neighbors, mask))
 
@@ -67,8 +76,12 @@ def edge_normals(
     """Inward direction in the surface, across its edge: length 1 on an edge, 0 away from all edges.
 
     On the edge of a plate all neighbours lie on one side; `unit_normals` are those of `normals`.
+
+    Raises:
+      ValueError: a shape or a dtype is wrong; the message names the argument.
     """
     offsets, weight = _offsets(points, neighbors, mask)
+    unit_normals = arguments.rows("unit_normals", unit_normals, jnp.shape(points), offsets)
     offsets = offsets * weight
     across = jnp.sum(offsets * unit_normals[:, None, :], axis=-1, keepdims=True)
     along = offsets - across * unit_normals[:, None, :]
@@ -94,7 +107,17 @@ def surface_covariances(
     edge. On an edge the distance across it fixes the point, and nothing else shows how far one of
     two plates has slid along the other. Only an edge meets an edge: a point whose partner lies
     inside a surface is as free as before.
+
+    Raises:
+      ValueError: a shape or a dtype is wrong, or not ``0 < epsilon <= 1``: two surfaces without any
+        thickness have no finite cost.
     """
+    unit_normals = arguments.cloud("unit_normals", unit_normals)
+    if edges is not None:
+        edges = arguments.rows("edges", edges, unit_normals.shape, unit_normals)
+    epsilon = arguments.scalar("epsilon", epsilon, unit_normals.dtype)
+    if not isinstance(epsilon, jax.core.Tracer) and epsilon > 1:
+        raise ValueError(f"epsilon = {epsilon}: choose 0 < epsilon <= 1.")
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
     if edges is not None:
         outer = outer + edges[:, :, None] * edges[:, None, :]

@@ -6,7 +6,10 @@ the origin, an angle of parallel vectors) it is zero, which is a valid subgradie
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from jaxreg.geometry import arguments
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -46,7 +49,18 @@ def included_angle(u: Float[Array, "... 3"], v: Float[Array, "... 3"]) -> Float[
 
     Accurate at 0 and at pi, where ``arccos`` loses half of its digits. A zero vector makes an angle
     of 0 with everything. Leading axes broadcast.
+
+    Raises:
+      ValueError: one of them is not ``(..., 3)`` of float32 or float64, or they do not broadcast.
     """
+    u, v = arguments.numbers("u", u), arguments.numbers("v", v)
+    arguments.one_dtype(u=u, v=v)
+    try:
+        shape = np.broadcast_shapes(u.shape, v.shape)
+    except ValueError:
+        shape = ()
+    if not (u.shape[-1:] == v.shape[-1:] == shape[-1:] == (3,)):
+        raise ValueError(f"u and v must be (..., 3) and broadcast, got {u.shape} and {v.shape}.")
     # An angle does not depend on lengths, so the scale may be a constant of the derivative.
     u, v = _unit_scale(u), _unit_scale(v)
     cross, dot = safe_norm(jnp.cross(u, v)), jnp.sum(u * v, axis=-1)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
+from jaxreg.geometry import arguments
 from jaxreg.geometry.eigen3x3 import pseudo_inverse
 from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.types import RigidTransform
@@ -27,13 +28,12 @@ def weighted_procrustes(
     one of least norm. First and higher derivatives are finite everywhere.
 
     Raises:
-      ValueError: the shapes are not ``(n, 3), (n, 3), (n,)``.
+      ValueError: the shapes are not ``(n, 3), (n, 3), (n,)``, or the dtypes not one of float32 and
+        float64.
     """
-    if source.shape != reference.shape or source.shape != (*weights.shape, 3):
-        raise ValueError(
-            "weighted_procrustes needs source (n, 3), reference (n, 3) and weights (n,), got "
-            f"{source.shape}, {reference.shape} and {weights.shape}."
-        )
+    source = arguments.cloud("source", source)
+    reference = arguments.rows("reference", reference, source.shape, source)
+    weights = arguments.rows("weights", weights, source.shape[:1], source)
     weights = jnp.maximum(weights, 0)
     largest = jnp.max(weights, initial=0)
     # Only the proportions of the weights matter; this keeps tiny and huge ones in range.
@@ -67,8 +67,9 @@ def robust_procrustes(
     others about its axis; here it loses its pull. With no rounds this is Eq. 13.
 
     Raises:
-      ValueError: as `weighted_procrustes`.
+      ValueError: as `weighted_procrustes`, or `rounds` is negative or not static.
     """
+    rounds = arguments.count("rounds", rounds)
 
     def again(transform: RigidTransform, _):
         forgiving = geman_mcclure_weights(source, reference, weights, transform)

@@ -12,6 +12,7 @@ import numpy as np
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
+from jaxreg.geometry import arguments
 from jaxreg.types import RigidTransform
 
 
@@ -30,7 +31,8 @@ def apply(transform: RigidTransform, points: Float[Array, "*n 3"]) -> Float[Arra
       ValueError: the transform has wrong shapes, or those of the points do not begin with its
         leading axes.
     """
-    batch = _leading_axes(transform)
+    batch = arguments.leading_axes("transform", transform)
+    arguments.check_numbers("points", points)
     if points.ndim < 1 or points.shape[-1] != 3:
         raise ValueError(f"points must have shape (..., 3), got {points.shape}.")
     if points.shape[:-1][: len(batch)] != batch:
@@ -52,7 +54,7 @@ def compose(second: RigidTransform, first: RigidTransform) -> RigidTransform:
     Raises:
       ValueError: one of them has wrong shapes, or their leading axes do not broadcast.
     """
-    batches = _leading_axes(second), _leading_axes(first)
+    batches = arguments.leading_axes("second", second), arguments.leading_axes("first", first)
     try:
         batch = np.broadcast_shapes(*batches)
     except ValueError:
@@ -77,7 +79,7 @@ def inverse(transform: RigidTransform) -> RigidTransform:
     Raises:
       ValueError: the transform has wrong shapes.
     """
-    _leading_axes(transform)
+    arguments.leading_axes("transform", transform)
     rotation = transform.rotation.mT
     column = transform.translation[..., None]
     translation = jnp.matmul(rotation, column, precision=Precision.HIGHEST)[..., 0]
@@ -90,7 +92,7 @@ def to_matrix(transform: RigidTransform) -> Float[Array, "*b 4 4"]:
     Raises:
       ValueError: the transform has wrong shapes.
     """
-    batch = _leading_axes(transform)
+    batch = arguments.leading_axes("transform", transform)
     top = jnp.concatenate([transform.rotation, transform.translation[..., None]], axis=-1)
     last = jnp.broadcast_to(jnp.eye(4, dtype=top.dtype)[3:], (*batch, 1, 4))
     return jnp.concatenate([top, last], axis=-2)
@@ -102,6 +104,7 @@ def from_matrix(matrix: Float[Array, "*b 4 4"]) -> RigidTransform:
     Raises:
       ValueError: it is not ``(..., 4, 4)``.
     """
+    arguments.check_numbers("matrix", matrix)
     if matrix.shape[-2:] != (4, 4):
         raise ValueError(f"a homogeneous matrix has shape (..., 4, 4), not {matrix.shape}.")
     return RigidTransform(matrix[..., :3, :3], matrix[..., :3, 3])
@@ -118,7 +121,7 @@ def to_jaxlie(transform: RigidTransform) -> Any:
         import jaxlie  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ImportError("to_jaxlie needs jaxlie: pip install jaxlie.") from None
-    _leading_axes(transform)
+    arguments.leading_axes("transform", transform)
     rotation = jaxlie.SO3.from_matrix(jnp.asarray(transform.rotation))
     return jaxlie.SE3.from_rotation_and_translation(rotation, jnp.asarray(transform.translation))
 
@@ -144,14 +147,3 @@ def nearest_rotation(matrix: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
-
-
-def _leading_axes(transform: RigidTransform) -> tuple[int, ...]:
-    """The axes before (3, 3) and (3,), which must be the same."""
-    rotation, translation = transform.rotation.shape, transform.translation.shape
-    if rotation[-2:] != (3, 3) or translation != (*rotation[:-2], 3):
-        raise ValueError(
-            f"a transform has a rotation (..., 3, 3) and a translation (..., 3), not {rotation} "
-            f"and {translation}."
-        )
-    return rotation[:-2]

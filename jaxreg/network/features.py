@@ -49,11 +49,11 @@ class _Normalize(nn.Module):
     @nn.compact
     def __call__(self, x, mask, *, train: bool):
         scale, bias = (
-            self.param(name, getattr(nn.initializers, kind), x.shape[-1:])
+            self.param(name, getattr(nn.initializers, kind), x.shape[-1:], jnp.float32)
             for name, kind in (("scale", "ones"), ("bias", "zeros"))
         )
         mean, var = (
-            self.variable("batch_stats", name, kind, x.shape[-1:])
+            self.variable("batch_stats", name, kind, x.shape[-1:], jnp.float32)
             for name, kind in (("mean", jnp.zeros), ("var", jnp.ones))
         )
         statistics = mean.value, var.value

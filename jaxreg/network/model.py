@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg.batching import one_at_a_time
 from jaxreg.config import Config, ModelConfig
-from jaxreg.geometry import rigid
+from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.procrustes import robust_procrustes
 from jaxreg.network import matching_blocks
-from jaxreg.network.features import DGCNN, relative_neighbors
+from jaxreg.network.features import BATCH_AXIS, DGCNN, relative_neighbors
 from jaxreg.network.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import (
@@ -92,7 +92,8 @@ def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
     """Random initial `params` and `batch_stats` for the network of `config`."""
     features, inliers = _networks(config)
     k = config.k + config.include_self
-    cloud, mask = jnp.ones((k + 1, 3)), jnp.ones(k + 1, bool)
+    # Float32 whatever the process' default: a run must load in any other process.
+    cloud, mask = jnp.ones((k + 1, 3), jnp.float32), jnp.ones(k + 1, bool)
     neighbors = jnp.zeros((k + 1, k), jnp.int32)
     structure = _structure(cloud, neighbors, config)
     first = features.init(
@@ -235,9 +236,14 @@ def iterate(
 
     Returns the transform from source to reference (the composition of the steps), what `observe`
     returned for each step and the source's graph, stacked, and the variables with updated statistics.
+
+    Raises:
+      ValueError: a shape, a dtype or a setting is wrong, or `train` without the `vmap` axis.
     """
-    source = PointCloud(without_padding(*source), source.mask)
-    reference = PointCloud(without_padding(*reference), reference.mask)
+    arguments.settings("config", config, ModelConfig)
+    source, reference = _checked(source, "source"), _checked(reference, "reference")
+    arguments.one_dtype(source=source.points, reference=reference.points)
+    variables = _in_dtype(variables, source.points.dtype, train)
     usable = source.mask & jnp.any(reference.mask)
     source_graph = neighborhood_graph(source, config)
     reference_graph = neighborhood_graph(reference, config)
@@ -275,6 +281,41 @@ def iterate(
     return transform, seen, variables
 
 
+def _checked(cloud: PointCloud, name: str) -> PointCloud:
+    """The cloud with its padding at zero."""
+    points = arguments.cloud(name, cloud.points)
+    mask = arguments.mask(f"{name}_mask", cloud.mask, points.shape[0])
+    assert mask is not None  # `arguments.mask` gives back what it is given
+    return PointCloud(without_padding(points, mask), mask)
+
+
+def _whole(name: str, points: Any, mask: Any) -> PointCloud:
+    """A cloud and its mask; without any valid point if one of them is not finite."""
+    points = arguments.cloud(name, points)
+    mask = arguments.mask(f"{name}_mask", mask, points.shape[0])
+    everywhere = jnp.ones(points.shape[0], bool)
+    return PointCloud(points, arguments.usable(points, everywhere if mask is None else mask))
+
+
+def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
+    """The weights in the precision of the clouds; those that training updates stay as they are."""
+    if not {"params", "batch_stats"} <= set(variables):
+        raise ValueError(
+            f"variables have the keys {sorted(variables)}: give both params and batch_stats, as "
+            "jaxreg.load_pretrained returns them."
+        )
+    if train:
+        try:
+            jax.lax.axis_index(BATCH_AXIS)
+        except NameError:
+            raise ValueError(
+                "train=True takes the statistics of a batch: call it under jax.vmap(..., "
+                f"axis_name={BATCH_AXIS!r})."
+            ) from None
+    cast = {"params": variables["params"]} if train else variables
+    return variables | jax.tree.map(lambda x: jnp.asarray(x, dtype), dict(cast))
+
+
 def register_pair(
     variables: Variables,
     source: Float[Array, "n 3"],
@@ -290,14 +331,19 @@ def register_pair(
 
     Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
     outside a mask are padding and have no effect, even if they are NaN. With no valid point in a
-    cloud `valid` is False and the transform is the identity.
+    cloud, or with one that is not finite, `valid` is False and the transform is the identity. The
+    weights are used in the dtype of the clouds.
 
     Raises:
-      ValueError: a cloud is not ``(n, 3)``; K is not smaller than a cloud; N_c exceeds the source.
+      ValueError: a cloud is not ``(n, 3)`` of float32 or float64; a mask is not ``(n,)`` of bools; K
+        is not smaller than a cloud; N_c exceeds the source; `variables` or `config` are no network's.
     """
     clouds = [
-        PointCloud(points, jnp.ones(points.shape[0], bool) if mask is None else mask)
-        for points, mask in ((source, source_mask), (reference, reference_mask))
+        _whole(name, points, mask)
+        for name, points, mask in (
+            ("source", source, source_mask),
+            ("reference", reference, reference_mask),
+        )
     ]
     transform, (confidence, copies), _ = iterate(
         variables,

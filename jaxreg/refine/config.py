@@ -4,6 +4,10 @@ import dataclasses
 import math
 from typing import Literal, get_args
 
+import numpy as np
+
+from jaxreg.geometry import arguments
+
 Method = Literal["icp", "point_to_plane", "gicp"]
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "gaussian"]
 Gradient = Literal["unrolled", "implicit"]
@@ -57,9 +61,18 @@ class RefineConfig:
     with many iterations. A motion that the pairs leave free keeps the derivative of the start.
     Second derivatives of "implicit" are not those of the solution."""
 
+    def __post_init__(self) -> None:
+        """Make plain numbers of NumPy's, whose dtype would enter into float32 computations."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.generic):
+                object.__setattr__(self, name, value.item())
+
 
 def check_options(config: RefineConfig) -> None:
     """Raise ValueError, with the value and what to choose instead, if a setting is out of range."""
+    arguments.settings("config", config, RefineConfig)
+    for name in ("iterations", "k", "correspondences_per_point"):
+        arguments.count(name, getattr(config, name))
     for name, choices in (("method", Method), ("kernel", Kernel), ("gradient", Gradient)):
         if getattr(config, name) not in get_args(choices):
             raise ValueError(

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.geometry import eigen3x3
+from jaxreg.geometry import arguments, eigen3x3
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.config import RefineConfig
@@ -50,10 +50,17 @@ def gicp(
         kernel_scale=kernel_scale,
     )  # fmt: skip
     scene = problem.scene
-    near_source, source_surface = _described(scene.source, source_mask, source_covariances, config)
-    near_reference, reference_surface = _described(
-        scene.reference, reference_mask, reference_covariances, config
-    )
+    x, y = scene.source, scene.reference
+    if source_covariances is not None:
+        source_covariances = arguments.rows(
+            "source_covariances", source_covariances, (*x.shape, 3), x
+        )
+    if reference_covariances is not None:
+        reference_covariances = arguments.rows(
+            "reference_covariances", reference_covariances, (*y.shape, 3), y
+        )
+    near_source, source_surface = _described(x, source_mask, source_covariances, config)
+    near_reference, reference_surface = _described(y, reference_mask, reference_covariances, config)
     scene = scene._replace(source_surface=source_surface, reference_surface=reference_surface)
     several = config.correspondences_per_point > 1
     problem = problem._replace(

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg.geometry import arguments
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
 from jaxreg.refine.config import RefineConfig
@@ -40,9 +41,10 @@ def point_to_plane(
         config=config, max_correspondence_distance=max_correspondence_distance,
         kernel_scale=kernel_scale,
     )  # fmt: skip
+    y = problem.scene.reference
     if reference_normals is None:
-        y = problem.scene.reference
         reference_normals = normals(y, knn(y, config.k, reference_mask), reference_mask)
+    reference_normals = arguments.rows("reference_normals", reference_normals, y.shape, y)
     scene = problem.scene._replace(reference_surface=reference_normals)
     return solve(problem._replace(scene=scene), POINT_TO_PLANE, config=config)
 

@@ -12,7 +12,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._xla import varying_like
-from jaxreg.geometry import frame, rigid
+from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.refine.config import RefineConfig, check_options
@@ -54,10 +54,16 @@ def set_up(
       ValueError: a shape or an option is wrong.
     """
     check_options(config)
+    if initial is not None:
+        initial = arguments.transform("initial", initial)
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
     if max_correspondence_distance is None:
         max_correspondence_distance = config.max_correspondence_distance
-    weighting = Weighting(config.kernel, kernel_scale, max_correspondence_distance, config.trim)
+    largest = arguments.scalar("max_correspondence_distance", max_correspondence_distance, x.dtype)
+    width = (
+        None if kernel_scale is None else arguments.scalar("kernel_scale", kernel_scale, x.dtype)
+    )
+    weighting = Weighting(config.kernel, width, largest, config.trim)
     scene = Scene(x, y, None, None, weighting.in_units_of(where.length))
     start = frame.transform_in(where, initial)
     return Problem(where, start, scene, source_mask, reference_mask)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.geometry import frame, rigid
+from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
 from jaxreg.geometry.small_linear import singular_vectors
@@ -103,6 +103,7 @@ def pose_uncertainty(
     Raises:
       ValueError: a shape or an option is wrong, or the reference has only `config.k` points or fewer.
     """
+    transform = arguments.transform("transform", transform)
     where, start, scene, *_ = set_up(
         source, reference, initial=transform, source_mask=source_mask,
         reference_mask=reference_mask, config=config,
@@ -111,6 +112,7 @@ def pose_uncertainty(
     y = scene.reference
     if reference_normals is None:
         reference_normals = normals(y, knn(y, config.k, reference_mask), reference_mask)
+    reference_normals = arguments.rows("reference_normals", reference_normals, y.shape, y)
     moved = rigid.apply(start, scene.source)
     pairs = closest_pairs(moved, y, source_mask, reference_mask, both_directions=False)
     return uncertainty_of_pairs(where, moved, y, reference_normals, pairs, scene.weighting)

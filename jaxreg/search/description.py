@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg.geometry import arguments
 from jaxreg.geometry.neighbors import squared_distances, without_padding
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.descriptors import (
@@ -74,14 +75,15 @@ def describe(
     A constant of every derivative: which points match is a discrete choice.
 
     Raises:
-      ValueError: `points` or `normals` is not (n, 3), or `mask` is not (n,).
+      ValueError: a shape or a dtype is wrong; the message names the argument.
     """
-    check_cloud("points", points, mask)
-    if normals is not None and normals.shape != points.shape:
-        raise ValueError(
-            f"normals must have the shape of the points, {points.shape}, got {normals.shape}: give "
-            "one unit normal for every point."
-        )
+    points = arguments.cloud("points", points)
+    mask = arguments.mask("mask", mask, points.shape[0])
+    unit = arguments.scalar("unit", unit, points.dtype)
+    if normals is not None:
+        normals = arguments.rows("normals", normals, points.shape, points)
+    if neighbors is not None:
+        neighbors = arguments.indices("neighbors", neighbors, points.shape[0])
     valid = jnp.ones(points.shape[0], bool) if mask is None else mask
     points = without_padding(points, valid) / jnp.asarray(unit, points.dtype)
     points = jax.lax.stop_gradient(points)
@@ -131,19 +133,3 @@ def compare(source: Described, reference: Described, *, network: Network | None 
             for moments, s in zip((one, other), surfaces, strict=True)
         )
     return Compared(here, there, jnp.matmul(one, other.T, precision=Precision.HIGHEST))
-
-
-def check_cloud(name: str, points: Array, mask: Array | None) -> None:
-    """Raise ValueError unless `points` is (n, 3) of floats, n >= 1, and `mask` (n,) of bools."""
-    if points.ndim != 2 or points.shape[1] != 3 or points.shape[0] == 0:
-        raise ValueError(
-            f"{name} must have shape (n, 3) with n >= 1, got {points.shape}: give one cloud, and use "
-            "jax.vmap for a batch."
-        )
-    if not jnp.issubdtype(points.dtype, jnp.floating):
-        raise ValueError(f"{name} must be of floats, got {points.dtype}: convert it to float32.")
-    if mask is not None and (mask.shape != points.shape[:1] or mask.dtype != bool):
-        raise ValueError(
-            f"the mask of {name} must be bool of shape {points.shape[:1]}, got {mask.dtype} of "
-            f"{mask.shape}: give True for every row that is a point, False for padding."
-        )

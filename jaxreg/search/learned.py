@@ -43,8 +43,13 @@ def init_network(key: PRNGKeyArray, inputs: int = len(_DEFAULT.radii) * INVARIAN
         }
     keys = jax.random.split(key, len(sizes))
     draw = jax.nn.initializers.glorot_uniform()
-    weights = {name: draw(k, size) for k, (name, size) in zip(keys, sizes.items(), strict=True)}
-    return weights | {f"{name}_bias": jnp.zeros(size[1]) for name, size in sizes.items()}
+    weights = {
+        name: draw(k, size, jnp.float32)
+        for k, (name, size) in zip(keys, sizes.items(), strict=True)
+    }
+    return weights | {
+        f"{name}_bias": jnp.zeros(size[1], jnp.float32) for name, size in sizes.items()
+    }
 
 
 def feature_config(config: SearchConfig = _DEFAULT) -> FeatureConfig:

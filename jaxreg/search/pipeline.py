@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import frame, rigid
+from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.description import check_cloud, describe
+from jaxreg.search.description import describe
 from jaxreg.search.learned import Network
 from jaxreg.search.nearest import nearest_packed
 from jaxreg.search.ranking import NEAR_WIDTH, sparsity_factor
-from jaxreg.search.stages import Search, check_transform, search_described
+from jaxreg.search.stages import Search, search_described
 from jaxreg.types import GlobalRegistration, RigidTransform
 
 _DEFAULT = SearchConfig()
@@ -47,14 +47,21 @@ def register_global(
     the search. The pose is differentiable in both clouds, through the last refinement only: the
     search is discrete.
 
+    A cloud with a point that is not finite counts as empty: `valid` is False, the pose the identity.
+
     `max_angle` (radians) bounds the rotation, which decides between the poses of a symmetric shape;
     if the search finds no pose within it, the best of all is returned. `score` is
     that of `ranking`, of the pose before the last refinement.
 
     Raises:
-      ValueError: a cloud is not (n, 3) of floats or has fewer than four rows, a mask or the similarity
-        has another shape, `max_angle` is not in (0, pi], or `network` was trained for other radii.
+      ValueError: a cloud is not (n, 3) of float32 or float64 or has fewer than four rows, a mask or
+        the similarity has another shape or dtype, `max_angle` is not in (0, pi], or `network` was
+        trained for other radii.
     """
+    arguments.settings("config", config, SearchConfig)
+    source, reference = arguments.clouds(source, reference)
+    source_mask = _usable("source_mask", source, source_mask)
+    reference_mask = _usable("reference_mask", reference, reference_mask)
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     described = (
         describe(x, source_mask, unit=1.0, config=config),
@@ -86,10 +93,13 @@ def search_poses(
 
     `also`: one more pose to try. Poses that turn by more than `max_angle` (radians) are not allowed.
     """
+    arguments.settings("config", config, SearchConfig)
+    source, reference = arguments.clouds(source, reference)
+    source_mask = _usable("source_mask", source, source_mask)
+    reference_mask = _usable("reference_mask", reference, reference_mask)
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     if also is not None:
-        check_transform(also)
-        also = frame.transform_in(where, also)
+        also = frame.transform_in(where, arguments.transform("also", also))
     found = search_described(
         describe(x, source_mask, unit=1.0, config=config),
         describe(y, reference_mask, unit=1.0, config=config),
@@ -100,6 +110,11 @@ def search_poses(
         config=config,
     )
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
+
+
+def _usable(name: str, points: Array, mask: Array | None) -> Array:
+    mask = arguments.mask(name, mask, points.shape[0])
+    return arguments.usable(points, jnp.ones(points.shape[0], bool) if mask is None else mask)
 
 
 def enter(
@@ -114,8 +129,6 @@ def enter(
 
     `unit` is `SearchConfig.unit`. Raises what `register_global` raises.
     """
-    check_cloud("source", source, source_mask)
-    check_cloud("reference", reference, reference_mask)
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
     factor = _RMS_OF_UNIT_SPHERE if unit is None else where.length / unit
     return where._replace(length=where.length / factor), x * factor, y * factor

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import rigid
+from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn
 from jaxreg.judge.evidence import read_evidence
 from jaxreg.judge.odds import log_odds
@@ -95,6 +95,7 @@ def search_described(
     Raises:
       ValueError: what `search_poses` raises.
     """
+    arguments.settings("config", config, SearchConfig)
     _check_search(source, reference, similarity, also, max_angle)
     compared = compare(source, reference, network=network)
     if similarity is not None:
@@ -126,25 +127,14 @@ def _check_search(source: Described, reference: Described, similarity, also, max
             f"the clouds have {n} and {m} rows, but the search needs {MATCHES + 1}: give more points, "
             "or pad smaller clouds and give masks."
         )
-    if similarity is not None and similarity.shape != (n, m):
-        raise ValueError(
-            f"similarity must have shape {(n, m)}, a row for every source point and a column for every "
-            f"reference point, got {similarity.shape}."
-        )
+    if similarity is not None:
+        arguments.rows("similarity", similarity, (n, m), source.points)
     if also is not None:
-        check_transform(also)
-    if not isinstance(max_angle, jax.Array) and not 0 < max_angle <= math.pi + 1e-6:
+        arguments.transform("also", also)
+    arguments.scalar("max_angle", max_angle, source.points.dtype, positive=False)
+    if not isinstance(max_angle, jax.core.Tracer) and not 0 < max_angle <= math.pi + 1e-6:
         raise ValueError(
             f"max_angle = {max_angle}: give an angle in (0, pi], in radians (np.radians(degrees))."
-        )
-
-
-def check_transform(also: RigidTransform) -> None:
-    """Raise ValueError unless `also` is one rotation (3, 3) and one translation (3,)."""
-    if (also.rotation.shape, also.translation.shape) != ((3, 3), (3,)):
-        raise ValueError(
-            f"also must be one transform with a rotation (3, 3) and a translation (3,), got "
-            f"{also.rotation.shape} and {also.translation.shape}."
         )
 
 

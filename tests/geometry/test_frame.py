@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.geometry import frame, rigid
+from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.types import RigidTransform
 
 
@@ -43,7 +43,7 @@ def test_single_points_have_unit_length():
 @pytest.mark.parametrize("shape", [(2, 5, 3), (0, 3), (5, 2), (3,)])
 def test_wrong_shapes_are_named(shape):
     with pytest.raises(ValueError, match=r"reference must have shape \(n, 3\)"):
-        frame.check_clouds(jnp.zeros((5, 3)), jnp.zeros(shape))
+        arguments.clouds(jnp.zeros((5, 3)), jnp.zeros(shape))
 
 
 @pytest.mark.parametrize("offset", [0.0, 5e6])

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import rigid
-from jaxreg.geometry.frame import check_clouds
+from jaxreg.geometry.arguments import clouds
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import RigidTransform
 from tests.compiled import icp
@@ -265,4 +265,4 @@ def test_wrong_options_are_named(options, message):
 @pytest.mark.parametrize("shape", [(2, 5, 3), (0, 3), (5, 2), (3,)])
 def test_wrong_shapes_are_named(shape):
     with pytest.raises(ValueError, match=r"reference must have shape \(n, 3\)"):
-        check_clouds(jnp.zeros((5, 3)), jnp.zeros(shape))
+        clouds(jnp.zeros((5, 3)), jnp.zeros(shape))

@@ -11,14 +11,13 @@ HOST = {
     "weights.released.available_weights",
     "weights.released.load_pretrained",
 }
-HOST |= {"scans.pair.register", "geometry.frame.check_clouds", "refine.config.check_options"}
+HOST |= {"scans.pair.register", "refine.config.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 HOST |= {"refine.gicp.generalized", "refine.methods.method_of"}
 HOST |= {"geometry.rigid.rotation_angle_deg", "geometry.rigid.nearest_rotation"}
 HOST |= {"geometry.frame.measure"}
 HOST |= {"search.learned.load_features", "search.learned.feature_config"}
-HOST |= {"search.learned.check_network", "search.description.check_cloud"}
-HOST |= {"search.stages.check_transform"}
+HOST |= {"search.learned.check_network"}
 HOST |= {"search.learned.init_network"}
 HOST |= {
     "io.read_cloud",
