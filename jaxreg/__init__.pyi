@@ -77,7 +77,7 @@ from .config import (
 )
 from .data.pairs import make_pair as make_pair
 from .data.procedural.shapes import sample_shape as sample_shape
-from .training import train as train
+from .training import batch_loss as batch_loss, train as train
 
 # Many pairs
 from .batching import map_pairs as map_pairs

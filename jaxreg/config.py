@@ -11,6 +11,9 @@ A TOML file lists only what differs from the defaults::
 
 import dataclasses
 import difflib
+import math
+import re
+import sys
 import tomllib
 import typing
 from pathlib import Path
@@ -172,6 +175,9 @@ class TrainConfig:
     """Steps between validations (and checkpoints)."""
     validation_pairs: int = 64
     """Pairs per validation."""
+    start: str = ""
+    """Weights to start from: released ones by their name, or the folder of a run; empty: random
+    ones. `jaxreg train ... --weights NAME` sets it."""
     seed: int = 0
     """The one seed; everything random derives from it."""
 
@@ -251,8 +257,9 @@ def _build(cls: type, content: dict[str, Any], where: str) -> Any:
     values = {}
     for key, value in content.items():
         if key not in hints:
-            near = difflib.get_close_matches(key, hints, n=1, cutoff=0.0)
-            raise ValueError(f"{where}: unknown key '{key}'; did you mean '{near[0]}'?")
+            near = difflib.get_close_matches(key, hints, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(hints)}."
+            raise ValueError(f"{where}: unknown key '{key}'; {hint}")
         values[key] = _convert(hints[key], value, f"{where}: '{key}'")
     return cls(**values)
 
@@ -278,3 +285,43 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if type(value) is not hint:
         raise ValueError(f"{where} must be {hint.__name__}, got {value!r}.")
     return value
+
+
+_LEAST = {
+    "model": dict.fromkeys(
+        ("k", "k_matching", "channels", "width", "inlier_width", "n_inliers", "iterations"), 1
+    ),
+    "pairs": {"points": 1, "kept": 1},
+    "data": dict.fromkeys(("train_shapes", "test_shapes", "train_draws", "test_draws"), 1),
+    "train": {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1},
+}
+"""The smallest allowed value of these settings; other numbers must not be negative."""
+_POSITIVE = ("learning_rate", "clip", "beta")
+_SHARES = ("bn_momentum", "ema", "test_share", "validation_share")
+_LIMITS = {"clip": math.inf, "rotation_max_deg": 360.0} | dict.fromkeys(_SHARES, 1.0)
+
+
+def check_options(section: str, settings: Any) -> None:
+    """Refuse numbers that make no sense in one section of a configuration, such as `config.model`.
+
+    Raises:
+      ValueError: a number is out of range; the message names it as in `model.k`, and the option.
+    """
+    for name, value in vars(settings).items():
+        least = _LEAST.get("pairs" if section == "test_pairs" else section, {}).get(name, 0)
+        most = _LIMITS.get(name, sys.float_info.max)
+        values = value if isinstance(value, tuple) else (value,)
+        numbers = [x for x in values if isinstance(x, int | float)]
+        positive = name in _POSITIVE
+        if values and all(least <= x <= most and (x > 0 or not positive) for x in numbers):
+            continue
+        bound = "positive" if positive else f"at least {least}"
+        if most < sys.float_info.max:
+            bound += f" and at most {most:g}"
+        elif most < math.inf and isinstance(value, float):
+            bound += " and finite"
+        option = f"{section.replace('_', '-')}.{re.sub('_(?!$)', '-', name)}"
+        raise ValueError(
+            f"{section}.{name} must be {bound}, got {value}: correct it in the configuration file or "
+            f"with --{option}."
+        )

@@ -4,10 +4,7 @@ A step depends only on the state and the seed: its pairs derive from ``fold_in(s
 that was interrupted and resumed is therefore bit-equal to one that was not.
 """
 
-import dataclasses
 import functools
-import math
-import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxreg._extras import extra
-from jaxreg.config import Config, TrainConfig
+from jaxreg.config import Config, TrainConfig, check_options
 from jaxreg.data import load_training, training_label
-from jaxreg.data.batches import pair_batches, validation_key
+from jaxreg.data.batches import key_of, pair_batches, same_streams, validation_key
 from jaxreg.data.pairs import make_pair, shape_points
 from jaxreg.evaluation.methods import network_method
 from jaxreg.evaluation.metrics import evaluate_transforms
@@ -32,7 +29,8 @@ from jaxreg.network.model import Variables, init_variables, iterate
 from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
 from jaxreg.weights import checkpoint
-from jaxreg.weights.released import check_new_name, save_weights
+from jaxreg.weights.checkpoint import load_checkpoint
+from jaxreg.weights.released import check_new_name, load_pretrained, save_weights
 
 with extra("train", "training"):
     import optax
@@ -72,11 +70,37 @@ def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 @functools.partial(jax.jit, static_argnames="config")
 def create_train_state(config: Config) -> TrainState:
     """The state before the first step; one program, because operation by operation it takes 300 MB."""
-    key = jax.random.fold_in(jax.random.key(config.train.seed), _INIT)
+    key = jax.random.fold_in(key_of(config.train.seed), _INIT)
     variables = init_variables(key, config.model)
     optimizer = create_optimizer(config.train).init(variables["params"])
     average = jax.tree.map(jnp.copy, variables)  # A donated buffer must not appear twice.
     return TrainState(jnp.zeros((), jnp.int32), variables, average, optimizer)
+
+
+def started_from(name: str, state: TrainState) -> TrainState:
+    """`state` with released weights, by their name, or the best ones of a run, by its folder.
+
+    Raises:
+      ValueError: there are none, or the network of `state` has other arrays.
+    """
+    load = load_checkpoint if (Path(name) / "best").is_dir() else load_pretrained
+    variables, trained = load(name)
+    there, here = (
+        {jax.tree_util.keystr(path, simple=True, separator="/"): x.shape for path, x in leaves}
+        for leaves, _ in map(jax.tree_util.tree_flatten_with_path, (variables, state.variables))
+    )
+    if there != here:
+        odd = min(part for part, _ in there.items() ^ here.items())
+        raise ValueError(
+            f"the weights '{name}' do not fit the network of the configuration ({odd}: "
+            f"{there.get(odd, 'none')} there, {here.get(odd, 'none')} here): train with the [model] of "
+            f"these weights, {trained.model}."
+        )
+    variables, average = (
+        jax.tree.map(lambda x, like: jnp.array(x, like.dtype), variables, state.variables)
+        for _ in range(2)  # A donated buffer must not appear twice.
+    )
+    return state._replace(variables=variables, average=average)
 
 
 def batch_loss(
@@ -116,7 +140,7 @@ def batch_loss(
 
 def draw_batch(step: Int[Array, ""], shapes: Float[Array, "s p 3"], config: Config) -> Pair:
     """The pairs of a training step: random shapes, random poses and crops."""
-    stream = jax.random.fold_in(jax.random.key(config.train.seed), _TRAIN)
+    stream = jax.random.fold_in(key_of(config.train.seed), _TRAIN)
     shape_key, pair_key = jax.random.split(jax.random.fold_in(stream, step))
     chosen = jax.random.randint(shape_key, (config.train.batch,), 0, shapes.shape[0])
     keys = jax.random.split(pair_key, config.train.batch)
@@ -135,7 +159,8 @@ def train_step(
     updates, optimizer = create_optimizer(config.train).update(gradient, state.optimizer, params)
     variables = {"params": optax.apply_updates(params, updates), "batch_stats": statistics}
     # A young average follows faster, so it soon forgets the initial weights.
-    decay = jnp.minimum(config.train.ema, (1 + state.step) / (10 + state.step))
+    step = state.step.astype(jnp.float32)
+    decay = jnp.minimum(jnp.float32(config.train.ema), (1 + step) / (10 + step))
     average = optax.incremental_update(variables, state.average, 1 - decay)
     logged = {"loss": loss, "gradient_norm": optax.tree.norm(gradient), **terms}
     return state._replace(
@@ -178,16 +203,19 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
 
     Writes `metrics.jsonl` (one object per line), the latest and the best checkpoint. The best has
     the lowest mean geodesic rotation error on the validation pairs, which are made from shapes that
-    are not trained on. A run that was stopped goes on from its last validation; one stopped before
+    are not trained on. With `config.train.start` it fine-tunes the weights of that name or run. A run
+    that was stopped goes on from its last validation; one stopped before
     its first validation starts over, with any configuration.
 
     Raises:
-      ValueError: `config.train` has a number out of range, `workdir` cannot be written to, the data
-        is missing, or `workdir` contains a run with another configuration.
+      ValueError: `config` has a number out of range, `workdir` cannot be written to, the data is
+        missing, the weights to start from do not exist or do not fit, another process trains in
+        `workdir`, or it contains a run with another configuration.
       FloatingPointError: the loss is not finite; the message says at which step. Saved checkpoints
         stay.
     """
-    _check_options(config.train)
+    for section in ("model", "loss", "pairs", "test_pairs", "data", "train"):
+        check_options(section, getattr(config, section))
     checkpoint.check_place(workdir)
     shapes, held_out = load_training(
         config.data,
@@ -201,9 +229,14 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
         checkpoint.open_run(workdir, config) as run,
         training_progress(config.train.steps) as progress,
     ):
-        state = run.restore(create_train_state(config))
+        with same_streams():
+            state = create_train_state(config)
+        state = run.restore(state)
+        if config.train.start and int(state.step) == 0:
+            state = started_from(config.train.start, state)
         while int(state.step) < config.train.steps:
-            state, logged = _train_step_jit(state, on_device, config=config)
+            with same_streams():
+                state, logged = _train_step_jit(state, on_device, config=config)
             number = int(state.step)
             entry = {"step": number} | {name: float(value) for name, value in logged.items()}
             if not np.isfinite([entry["loss"], entry["gradient_norm"]]).all():
@@ -221,26 +254,6 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
             run.log(entry)
             progress(entry)
     return checkpoint.load_checkpoint(workdir)[0]
-
-
-_LEAST = {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1}
-"""The smallest allowed value of these settings; the others must not be negative."""
-_POSITIVE = ("learning_rate", "clip")
-
-
-def _check_options(config: TrainConfig) -> None:
-    for name, value in dataclasses.asdict(config).items():
-        least = _LEAST.get(name, 0)
-        most = {"ema": 1.0, "clip": math.inf}.get(name, sys.float_info.max)
-        if least <= value <= most and (value > 0 or name not in _POSITIVE):
-            continue
-        bound = "positive" if name in _POSITIVE else f"at least {least}"
-        if name != "clip" and isinstance(value, float):
-            bound += " and at most 1" if name == "ema" else " and finite"
-        raise ValueError(
-            f"train.{name} must be {bound}, got {value}: correct it in the configuration file or with "
-            f"--train.{name.replace('_', '-')}."
-        )
 
 
 def release(

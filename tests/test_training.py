@@ -1,8 +1,10 @@
 """Training: unsupervised, resumable bit for bit, and stopped by a loss that is not finite."""
 
 import dataclasses
+import errno
 import functools
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from jaxreg import training
-from jaxreg.config import Config, DataConfig, TrainConfig, from_dict
+from jaxreg.config import Config, DataConfig, TrainConfig, check_options, from_dict
 from jaxreg.data import training_label
 from jaxreg.types import RigidTransform
 from jaxreg.weights import checkpoint
@@ -273,7 +275,8 @@ def test_settings_that_make_no_sense_are_refused_before_the_work(
 
 
 def test_settings_at_the_end_of_their_range_are_taken():
-    training._check_options(
+    check_options(
+        "train",
         TrainConfig(
             steps=1, batch=1, validate_every=1, validation_pairs=1, warmup=0, weight_decay=0.0,
             final_learning_rate=0.0, clip=float("inf"), ema=1.0, seed=0,
@@ -379,3 +382,78 @@ def test_the_data_of_a_card_is_what_was_trained_on(tmp_path):
     }
     for name, data in called.items():
         assert training_label(data, tmp_path) == name
+
+
+def test_a_second_run_in_a_workdir_is_refused_while_the_first_goes_on(config, tmp_path):
+    with (
+        checkpoint.open_run(tmp_path, config),
+        pytest.raises(ValueError, match="another process trains in .*--workdir"),
+        checkpoint.open_run(tmp_path, config),
+    ):
+        pass
+    with checkpoint.open_run(tmp_path, config):  # The lock has ended with the first run.
+        pass
+
+
+def test_a_full_disk_is_one_error_and_leaves_nothing(config, tmp_path, monkeypatch):
+    def full(handle):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with checkpoint.open_run(tmp_path, config) as run:
+        with pytest.raises(OSError, match="No space left.*step 3.*same command") as caught:
+            run.save(3, {"w": jnp.zeros(5)}, 0.1)
+        assert not list(tmp_path.glob("*.part"))
+        assert run._latest.latest_step() is None
+    assert caught.value.filename == str(tmp_path)
+
+
+def with_section(config, section, **values):
+    part = dataclasses.replace(getattr(config, section), **values)
+    return dataclasses.replace(config, **{section: part})
+
+
+def test_training_starts_from_weights_of_the_same_network_only(config):
+    state = jax.eval_shape(lambda: training.create_train_state(config))
+    with pytest.raises(ValueError, match=r"'modelnet40' do not fit .*\[model\]"):
+        training.started_from("modelnet40", state)
+    with pytest.raises(ValueError, match="no released weights 'none-such'"):
+        training.started_from("none-such", state)
+    released, trained = load_pretrained("modelnet40")
+    fits = jax.eval_shape(lambda: training.create_train_state(trained))
+    started = training.started_from("modelnet40", fits)
+    for given in (started.variables, started.average):
+        jax.tree.map(np.testing.assert_array_equal, given, released)
+
+
+@pytest.mark.parametrize("x64", [False, True])
+def test_a_step_keeps_every_dtype_whatever_the_process_default(config, x64):
+    """So that a run made with x64 loads without, and the other way round."""
+    shapes = jax.ShapeDtypeStruct((4, 32, 3), np.float32)
+    with jax.enable_x64(x64):
+        state = jax.eval_shape(lambda: training.create_train_state(config))
+        after, _ = jax.eval_shape(
+            functools.partial(training.train_step, config=config), state, shapes
+        )
+    assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, state)
+    assert not [x for x in jax.tree.leaves(state) if x.dtype == np.float64]
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize(
+    ("section", "name", "value"),
+    [
+        ("model", "k", 0), ("model", "width", 0), ("model", "iterations", 0),
+        ("model", "channels", ()), ("model", "channels", (8, 0)), ("model", "bn_momentum", 2.0),
+        ("model", "alpha", float("nan")), ("model", "robust_rounds", -1),
+        ("pairs", "jitter", -1.0), ("pairs", "translation_max", -1.0), ("pairs", "points", 0),
+        ("pairs", "rotation_max_deg", 400.0), ("test_pairs", "outliers", -1),
+        ("loss", "lambda_", -1.0), ("loss", "beta", 0.0), ("data", "train_shapes", 0),
+    ],
+)  # fmt: skip
+def test_numbers_of_every_section_are_checked_before_the_work(
+    config, tmp_path, section, name, value
+):
+    with pytest.raises(ValueError, match=rf"{section}\.{name} must be .*--"):
+        training.train(with_section(config, section, **{name: value}), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -156,6 +156,8 @@ def _as_trained(options: Options, path: Path, given: Collection[str], method: st
 def _report(options: Options, path: Path, scored: score.Scored) -> None:
     result = score.figures(scored) | {"config": path.stem}
     Console().print(results_table([result], title=str(path)))
+    if options.transforms and (hint := score.other_convention(scored)):
+        say(hint)
     if options.json:
         Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

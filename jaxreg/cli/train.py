@@ -1,21 +1,23 @@
 """Train a network: `jaxreg train CONFIG.toml --workdir DIR [--section.field value ...]`.
 
 CONFIG.toml is your own file or the name of one that comes with jaxreg (a wrong name lists them).
-Run again with the same --workdir to resume. Writes metrics.jsonl, curves.png, the latest checkpoint
+--weights NAME fine-tunes released weights, or the best ones of a run if NAME is its folder. Run again
+with the same --workdir to resume. Writes metrics.jsonl, curves.png, the latest checkpoint
 and the one with the lowest validation error.
 """
 
 import dataclasses
 import shlex
 import sys
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from jaxreg.cli import process
-from jaxreg.cli.options import SUCCESS, parse, say, status_of, told
-from jaxreg.config import Config
+from jaxreg.cli.options import SUCCESS, given_fields, parse, say, status_of, told
+from jaxreg.config import Config, load_config
 from jaxreg.data import root_of
 from jaxreg.training import release, train
 from jaxreg.weights.released import check_new_name
@@ -43,9 +45,23 @@ def main(arguments: list[str] | None = None) -> int:
     path, options = parse(Options, description=__doc__, arguments=arguments, program="jaxreg train")
     command = shlex.join(["jaxreg", "train", *arguments])
     return status_of(
-        lambda: _run(options, path, command),
+        lambda: _run(_with_start(options, path, given_fields(Options, arguments)), path, command),
         interrupted="interrupted: run the same command to go on from the last validation",
     )
+
+
+def _with_start(options: Options, path: Path, given: Collection[str]) -> Options:
+    """`--weights NAME` as the weights to start from; those that the file names are for evaluation."""
+    config = options.config
+    if "weights" not in given or not config.weights:
+        return options
+    if "train.start" in given and config.train.start != config.weights:
+        raise ValueError(
+            f"--weights {config.weights} and --train.start {config.train.start} differ: give one."
+        )
+    training = dataclasses.replace(config.train, start=config.weights)
+    config = dataclasses.replace(config, train=training, weights=load_config(path).weights)
+    return dataclasses.replace(options, config=config)
 
 
 def _run(options: Options, path: Path, command: str) -> int:

@@ -1,6 +1,7 @@
 """Streams of pairs in batches of equal size: made from shapes, or given by a data set."""
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +16,24 @@ from jaxreg.types import Pair, PointCloud, RigidTransform
 _TEST, _VALIDATION = 0, 1  # Streams of random keys below the seed of the test pairs.
 
 
+def key_of(seed: int) -> PRNGKeyArray:
+    """The key of a seed, whatever generator is the default of the process."""
+    return jax.random.key(seed, impl="threefry2x32")
+
+
+def same_streams() -> AbstractContextManager:
+    """Compile programs in here, so that the numbers of a key do not follow the process' settings."""
+    return jax.threefry_partitionable(True)
+
+
 def key_of_tests(seed: int) -> PRNGKeyArray:
     """Key of the stream of test pairs; pair `i` of it is made from ``fold_in(key, i)``."""
-    return jax.random.fold_in(jax.random.key(seed), _TEST)
+    return jax.random.fold_in(key_of(seed), _TEST)
 
 
 def validation_key(seed: int) -> PRNGKeyArray:
     """Key of the stream of validation pairs."""
-    return jax.random.fold_in(jax.random.key(seed), _VALIDATION)
+    return jax.random.fold_in(key_of(seed), _VALIDATION)
 
 
 def _make_batch(key, numbers, shapes, *, config: PairConfig) -> Pair:
@@ -43,10 +54,9 @@ def pair_batches(
     """
     for start in range(0, len(shapes), batch):
         numbers = np.arange(start, start + batch) % len(shapes)
-        yield (
-            _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config),
-            min(batch, len(shapes) - start),
-        )
+        with same_streams():
+            pairs = _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config)
+        yield pairs, min(batch, len(shapes) - start)
 
 
 def _given_batch(key, numbers, source, target, transform, *, config: PairConfig) -> Pair:
@@ -77,7 +87,9 @@ def given_pair_batches(
         numbers = np.arange(start, start + batch) % len(source)
         matrices = transforms[numbers].astype(source.dtype)
         chosen = (jnp.asarray(numbers), source[numbers], target[numbers], matrices)
-        yield _given_batch_jit(key, *chosen, config=config), min(batch, len(source) - start)
+        with same_streams():
+            pairs = _given_batch_jit(key, *chosen, config=config)
+        yield pairs, min(batch, len(source) - start)
 
 
 def true_transforms(batches: Iterator[tuple[Pair, int]]) -> RigidTransform:

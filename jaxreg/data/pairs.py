@@ -13,9 +13,9 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxreg.config import PairConfig
+from jaxreg.config import PairConfig, check_options
 from jaxreg.data import crops
-from jaxreg.geometry import rigid
+from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import without_padding
 from jaxreg.types import Pair, PointCloud, RigidTransform
 
@@ -74,11 +74,14 @@ def make_pair(
     `independent_crops` each cloud has its own viewpoint or direction.
 
     Raises:
-      ValueError: the shape is not (p, 3), or the sizes do not fit: see `pair_sizes`.
+      ValueError: the shape is not (p, 3) of float32 or float64, its mask not (p,) of bools, a number
+        of `config` makes no sense, or the sizes do not fit: see `pair_sizes`.
     """
-    if shape.ndim != 2 or shape.shape[1] != 3:
-        raise ValueError(f"shape must be (p, 3), got {shape.shape}: use jax.vmap for a batch.")
+    arguments.settings("config", config, PairConfig)
+    shape = arguments.cloud("shape", shape)
+    shape_mask = arguments.mask("shape_mask", shape_mask, shape.shape[0])
     pair_sizes(config, shape.shape[0])
+    check_options("pairs", config)
     keys = _split(key)
     mask = jnp.ones(shape.shape[0], bool) if shape_mask is None else shape_mask
     clean = PointCloud(without_padding(shape, shape_mask), mask)
@@ -101,8 +104,11 @@ def make_pair_from_scans(
     Raises:
       ValueError: `kept` is larger than one of the clouds, or `outliers` is negative.
     """
-    for cloud in (source, reference):
+    for name, cloud in (("source", source), ("reference", reference)):
+        arguments.cloud(f"{name}.points", cloud.points)
+        arguments.mask(f"{name}.mask", cloud.mask, cloud.points.shape[0])
         _kept(config, cloud.points.shape[0])
+    check_options("pairs", config)
     keys = _split(key)
     source = source._replace(points=without_padding(*source))
     reference = reference._replace(points=without_padding(*reference))

@@ -12,18 +12,21 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxreg.config import Config
+from jaxreg.config import Config, check_options
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
 from jaxreg.evaluation import methods, metrics
 from jaxreg.evaluation.run import evaluate_method
+from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.io.arrays import read_arrays
 from jaxreg.progress import counting_progress
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import Pair, RigidTransform
 
 _REFINEMENTS = ("icp", "point_to_plane", "gicp")
+_ALIKE_DEG = 1.0
+"""Rotations that differ by less than this in the median fit."""
 _TRAINING_DATA = ("train_categories", "validation_share", "train_shapes", "train_draws")
 
 
@@ -96,6 +99,8 @@ def evaluate(
       ValueError: both or neither of the two are given; an unknown method or refinement; missing
         data, weights or files.
     """
+    for section in ("model", "test_pairs", "data"):
+        check_options(section, getattr(config, section))
     name = _evaluated(config, method, transforms)
     improve = _refinement(refine)
     count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
@@ -189,6 +194,35 @@ def figures(scored: Scored) -> dict[str, Any]:
     found = metrics.evaluate_transforms(scored.predicted, scored.truth)
     named = {"method": scored.method, "dataset": scored.dataset}
     return named | found | {"seconds_per_pair": scored.seconds}
+
+
+def other_convention(scored: Scored) -> str:
+    """A hint if the transforms are right in another convention than ``y = R x + t``; else empty."""
+    predicted, truth = (
+        RigidTransform(*(np.asarray(part, np.float64) for part in transform))
+        for transform in (scored.predicted, scored.truth)
+    )
+
+    def median(rotation: np.ndarray) -> float:
+        return float(np.median(rotation_angle_deg(rotation, truth.rotation)))
+
+    transposed = np.swapaxes(predicted.rotation, 1, 2)
+    here, there = median(predicted.rotation), median(transposed)
+    if there > _ALIKE_DEG or here < 10 * max(there, _ALIKE_DEG):
+        return ""
+    back = -np.einsum("nij,nj->ni", transposed, predicted.translation)
+    errors = (np.linalg.norm(t - truth.translation, axis=1) for t in (predicted.translation, back))
+    same, inverse = map(np.median, errors)
+    kind, remedy = (
+        ("go from reference to source", "their inverses (R^T, -R^T t)")
+        if inverse < same
+        else ("are for row vectors, y = x R + t", "rotation.transpose(0, 2, 1)")
+    )
+    return (
+        f"the transposed rotations fit: {there:.2g} degrees in the median, in place of {here:.3g}. It "
+        f"seems that these transforms {kind}; in the convention here, y = R x + t from source to "
+        f"reference, they are {remedy}."
+    )
 
 
 def _keep_first(

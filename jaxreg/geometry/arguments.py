@@ -64,7 +64,9 @@ def rows(name: str, given: Any, shape: tuple[int, ...], like: Array) -> Array:
     """
     given = numbers(name, given)
     if given.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {given.shape}.")
+        raise ValueError(
+            f"{name} must have shape {shape}, got {given.shape}: give one row for every point."
+        )
     if given.dtype != like.dtype:
         raise ValueError(
             f"{name} has dtype {given.dtype}, but the points {like.dtype}: give both in one, as in "
@@ -119,8 +121,8 @@ def leading_axes(name: str, given: Any) -> tuple[int, ...]:
     rotation, translation = given.rotation.shape, given.translation.shape
     if rotation[-2:] != (3, 3) or translation != (*rotation[:-2], 3):
         raise ValueError(
-            f"{name} must have a rotation (..., 3, 3) and a translation (..., 3), not {rotation} "
-            f"and {translation}."
+            f"{name} must be a transform with a rotation (..., 3, 3) and a translation (..., 3), not "
+            f"{rotation} and {translation}."
         )
     return rotation[:-2]
 

@@ -13,7 +13,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg.batching import one_at_a_time
-from jaxreg.config import Config, ModelConfig
+from jaxreg.config import Config, ModelConfig, check_options
 from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_sqrt
@@ -241,6 +241,7 @@ def iterate(
       ValueError: a shape, a dtype or a setting is wrong, or `train` without the `vmap` axis.
     """
     arguments.settings("config", config, ModelConfig)
+    check_options("model", config)
     source, reference = _checked(source, "source"), _checked(reference, "reference")
     arguments.one_dtype(source=source.points, reference=reference.points)
     variables = _in_dtype(variables, source.points.dtype, train)

@@ -20,6 +20,11 @@ from jaxreg._extras import extra
 from jaxreg.config import Config
 from jaxreg.network.model import Variables, init_variables
 
+try:
+    import fcntl
+except ImportError:  # Windows has no locks that end with the process and leave no file
+    fcntl = None
+
 with extra("train", "a checkpoint"):
     import orbax.checkpoint as ocp
 
@@ -43,6 +48,7 @@ class Run:
             state=ocp.args.StandardSave(state),
             config=ocp.args.JsonSave(configuration.to_dict(self.config) | {"error": error}),
         )
+        self._check_space(state, step)
         if error < self._best_error():
             self._best.save(step, args=arguments)
             self._best.wait_until_finished()
@@ -84,6 +90,24 @@ class Run:
         self._latest.close()
         self._best.close()
 
+    def _check_space(self, state: Any, step: int) -> None:
+        """Raise OSError if there is no room for `state`: Orbax says so in hundreds of lines."""
+        size = sum(x.nbytes for x in jax.tree.leaves(state))
+        part = self.directory / "space.part"
+        try:
+            with part.open("wb") as file:
+                file.write(bytes(size))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            told = (
+                f"{error.strerror}: no room for the checkpoint of step {step} ({size / 1e6:.1f} MB); "
+                "make room and run the same command again to go on from the last one"
+            )
+            raise OSError(error.errno, told, str(self.directory)) from None
+        finally:
+            part.unlink(missing_ok=True)
+
     def _best_error(self) -> float:
         return np.inf if self._best.latest_step() is None else _saved_config(self._best)[1]
 
@@ -112,14 +136,42 @@ def check_place(workdir: str | Path) -> None:
 
 @contextlib.contextmanager
 def open_run(workdir: str | Path, config: Config) -> Iterator[Run]:
-    """The run in `workdir`, created if it does not exist; closed (and written out) at the end."""
+    """The run in `workdir`, created if it does not exist; closed (and written out) at the end.
+
+    Raises:
+      ValueError: another process trains there.
+    """
     directory = Path(workdir).resolve()
     directory.mkdir(parents=True, exist_ok=True)
-    run = Run(directory, config)
+    with _alone(directory):
+        run = Run(directory, config)
+        try:
+            yield run
+        finally:
+            run.close()
+
+
+@contextlib.contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Hold a lock on the directory, which ends with the process, however that ends."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(directory, os.O_RDONLY)
     try:
-        yield run
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(
+            f"another process trains in {directory}: wait until it has ended, or choose another "
+            "--workdir."
+        ) from None
+    except OSError:
+        pass  # some network file systems have no locks
+    try:
+        yield
     finally:
-        run.close()
+        os.close(handle)
 
 
 def best_config(workdir: str | Path) -> tuple[Config, float]:

@@ -392,7 +392,7 @@ def test_sizes_that_do_not_fit(changes, points, message):
 
 @pytest.mark.untyped
 def test_a_batch_of_shapes_is_refused():
-    with pytest.raises(ValueError, match=r"must be \(p, 3\), got \(2, 100, 3\): use jax.vmap"):
+    with pytest.raises(ValueError, match=r"must have shape .*got \(2, 100, 3\).*jax.vmap"):
         make_pair(jax.random.key(0), jnp.zeros((2, 100, 3)), SMALL)
 
 

@@ -134,3 +134,19 @@ def test_pairs_of_a_file_are_scored_in_their_own_pose(tmp_path):
     assert result["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-5)
     with pytest.raises(ValueError, match="needs data.name = 'icl_nuim'"):
         scored(from_dict({"data": {"test_pairs_from": "file"}}), method="icp")
+
+
+def test_transforms_in_another_convention_are_told(seed):
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(20, random_state=seed).as_matrix()
+    truth = RigidTransform(rotation, rng.normal(size=(20, 3)))
+    back = np.linalg.inv(np.asarray(jax.vmap(rigid.to_matrix)(jax.tree.map(jnp.asarray, truth))))
+
+    def told(rotation, translation):
+        predicted = RigidTransform(rotation, translation)
+        return score.other_convention(score.Scored("", "", predicted, truth, None, None))
+
+    assert told(*truth) == ""
+    assert told(Rotation.random(20, random_state=seed + 1).as_matrix(), truth.translation) == ""
+    assert "row vectors" in told(rotation.swapaxes(1, 2), truth.translation)
+    assert "from reference to source" in told(back[:, :3, :3], back[:, :3, 3])

@@ -354,7 +354,7 @@ def test_static_faults_are_named(rng):
         registration(SMALL)(variables, source[:11], reference)
     with pytest.raises(ValueError, match=r"k = 4 .* n = 4 points"):
         registration(SMALL)(variables, source, reference[:4])
-    with pytest.raises(ValueError, match=r"\(n, 3\), got \(20, 2\)"):
+    with pytest.raises(ValueError, match=r"\(n, 3\) .*got \(20, 2\)"):
         registration(SMALL)(variables, source[:, :2], reference)
     with pytest.raises(ValueError, match=r"use jax.vmap for a batch"):
         registration(SMALL)(variables, source[None], reference[None])
