@@ -16,6 +16,12 @@ from jaxreg.refine.config import RefineConfig
 from jaxreg.types import RigidTransform
 from tests.compiled import icp
 
+KERNELS = (
+    "none",
+    "geman_mcclure",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("huber", "cauchy", "gaussian")),
+)
+
 plain = partial(RefineConfig, kernel="none")
 
 
@@ -64,7 +70,7 @@ def test_equals_the_loop(options):
     np.testing.assert_allclose(result.translation, translation, atol=1e-9)
 
 
-@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "gaussian"])
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_recovers_a_known_motion(kernel):
     source, reference, truth = make_pair(2)
     result = icp(jnp.asarray(source), jnp.asarray(reference), config=plain(kernel=kernel))
@@ -157,7 +163,7 @@ def pose_sum(source, reference, options, **masks):
     return jnp.sum(result.rotation * probe) + jnp.sum(result.translation * probe[0])
 
 
-@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure", "gaussian"])
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_derivatives_equal_finite_differences(kernel):
     source, reference, _ = make_pair(10, n=30, m=40, noise=0.05)
     options = {"iterations": 4, "kernel": kernel, "trim": 0.9}
