@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxreg.types import RigidTransform
@@ -136,7 +137,7 @@ def scalar(name: str, given: Any, dtype: Any, *, positive: bool = True) -> Array
     array = np.ndim(given) != 0 or not jnp.issubdtype(jnp.result_type(given), np.number)
     if array or jnp.issubdtype(jnp.result_type(given), np.complexfloating):
         raise ValueError(f"{name} must be one real number, got shape {np.shape(given)}.")
-    if positive and not isinstance(given, jax.core.Tracer) and not given > 0:
+    if positive and not isinstance(given, Tracer) and not given > 0:
         raise ValueError(f"{name} = {given}: give a positive number.")
     return given if type(given) in (int, float) else jnp.asarray(given, dtype)
 
@@ -150,7 +151,7 @@ def count(name: str, given: Any, least: int = 0) -> int:
     try:
         found = operator.index(given)
     except TypeError:  # and so are JAX's errors of traced integers
-        kind = "traced" if isinstance(given, jax.core.Tracer) else repr(given)
+        kind = "traced" if isinstance(given, Tracer) else repr(given)
         raise ValueError(
             f"{name} must be a Python integer, but is {kind}: make it static (static_argnames of "
             "jax.jit)."
@@ -201,7 +202,7 @@ def settings(name: str, given: Any, kind: type) -> None:
     if not isinstance(given, kind):
         raise ValueError(f"{name} must be a jaxreg.{kind.__name__}, got {type(given).__name__}.")
     for field, value in vars(given).items():
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             raise ValueError(
                 f"{name}.{field} is traced: settings are static. Give a Python number, or make the "
                 "function that is jitted take it by static_argnames."

@@ -4,8 +4,8 @@ import contextlib
 import os
 from typing import Literal
 
-import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from jaxreg.geometry import foreign
@@ -84,7 +84,7 @@ def _as_floats(points: object, name: str) -> np.ndarray:
         raise ValueError(
             f"{name} is {str(points)!r}: give its points, as jaxreg.read_cloud({str(points)!r}) reads."
         )
-    if isinstance(points, jax.core.Tracer):
+    if isinstance(points, Tracer):
         raise ValueError(
             f"{name} is traced, but this function runs on the host: under jit, grad or vmap use "
             "jaxreg.register_global, or jaxreg.gicp from a start."

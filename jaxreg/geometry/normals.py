@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
@@ -115,13 +116,13 @@ def surface_covariances(
     unit_normals = arguments.cloud("unit_normals", unit_normals)
     if edges is not None:
         edges = arguments.rows("edges", edges, unit_normals.shape, unit_normals)
-    epsilon = arguments.scalar("epsilon", epsilon, unit_normals.dtype)
-    if not isinstance(epsilon, jax.core.Tracer) and epsilon > 1:
+    thickness = arguments.scalar("epsilon", epsilon, unit_normals.dtype)
+    if not isinstance(epsilon, Tracer) and epsilon > 1:
         raise ValueError(f"epsilon = {epsilon}: choose 0 < epsilon <= 1.")
     outer = unit_normals[:, :, None] * unit_normals[:, None, :]
     if edges is not None:
         outer = outer + edges[:, :, None] * edges[:, None, :]
-    return jnp.eye(3, dtype=outer.dtype)[None] - (1 - epsilon) * outer
+    return jnp.eye(3, dtype=outer.dtype)[None] - (1 - thickness) * outer
 
 
 def smallest_eigenvector(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import arguments, rigid
@@ -132,7 +133,7 @@ def _check_search(source: Described, reference: Described, similarity, also, max
     if also is not None:
         arguments.transform("also", also)
     arguments.scalar("max_angle", max_angle, source.points.dtype, positive=False)
-    if not isinstance(max_angle, jax.core.Tracer) and not 0 < max_angle <= math.pi + 1e-6:
+    if not isinstance(max_angle, Tracer) and not 0 < max_angle <= math.pi + 1e-6:
         raise ValueError(
             f"max_angle = {max_angle}: give an angle in (0, pi], in radians (np.radians(degrees))."
         )

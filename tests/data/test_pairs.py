@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.config import PairConfig
 from jaxreg.data import modelnet
+from jaxreg.data.batches import key_of_tests, pair_batches
 from jaxreg.data.pairs import make_pair, make_pair_from_scans, pair_sizes
 from jaxreg.data.procedural import shapes
 from jaxreg.types import PointCloud
@@ -420,3 +421,22 @@ def test_overlap_on_procedural_shapes_is_that_of_the_predecessor(seed):
     rng = np.random.default_rng(seed)
     theirs = [predecessor_overlap(cloud.astype(np.float64), rng) for cloud in clouds]
     assert stats.ks_2samp(ours, theirs).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("setting", ["rbg", "unsafe_rbg", "not partitionable"])
+def test_test_pairs_do_not_follow_the_generator_of_the_process(setting):
+    shapes = np.random.default_rng(0).normal(size=(2, 100, 3)).astype(np.float32)
+
+    def drawn():
+        batches = pair_batches(shapes, key_of_tests(3), config=SMALL, batch=2)
+        return next(batches)[0].transform
+
+    expected = drawn()
+    other = (
+        jax.threefry_partitionable(False)
+        if setting.startswith("not")
+        else jax.default_prng_impl(setting)
+    )
+    with other:
+        found = drawn()
+    jax.tree.map(np.testing.assert_array_equal, found, expected)

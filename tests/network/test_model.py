@@ -14,7 +14,7 @@ import pytest
 from jaxreg.config import Config, LossConfig, ModelConfig
 from jaxreg.network import losses
 from jaxreg.network.features import BATCH_AXIS
-from jaxreg.network.model import iterate, register_pair
+from jaxreg.network.model import init_variables, iterate, register_pair
 from jaxreg.types import PointCloud
 from tests import oracles
 from tests.compiled import knn
@@ -423,3 +423,23 @@ def test_identical_clouds_train_with_finite_gradients(rng):
     """T01."""
     pairs = [2 * [rng.uniform(-1, 1, (20, 3))] for _ in range(2)]
     assert_finite(trained(variables_of(SMALL), *batch_of(pairs, (20, 20), 0.0)))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_in_a_batch_only_the_cloud_that_is_not_finite_is_not_valid(bad):
+    """Under vmap it cannot be an error; the transform is the identity, as of an empty cloud."""
+    config = ModelConfig(channels=(4,), width=8, n_inliers=6, k=3, k_matching=3, iterations=1)
+    variables = init_variables(jax.random.key(0), config)
+    clouds = np.random.default_rng(0).normal(size=(2, 12, 3)).astype(np.float32)
+    clouds[1, 4, 2] = bad
+
+    def run(x):
+        found = register_pair(variables, x, jnp.asarray(clouds[0]), config=config)
+        return jnp.sum(found.rotation), (found.valid, found.rotation)
+
+    (_, (valid, rotation)), gradient = jax.jit(jax.vmap(jax.value_and_grad(run, has_aux=True)))(
+        jnp.asarray(clouds)
+    )
+    assert valid.tolist() == [True, False]
+    np.testing.assert_allclose(rotation[1], np.eye(3), atol=1e-6)
+    assert np.isfinite(gradient).all()
