@@ -20,8 +20,7 @@ Compilation. The tests compile thousands of programs that run for a millisecond,
 nothing here, and XLA writes its fusions by the emitter that compiles in half the time; its other
 passes run as ever, and the processes that some tests start (the README, examples, the command line)
 compile as a user's do. Functions that tests call plainly are in tests/compiled.py. A module runs in
-one process (`--dist loadfile`), which compiles once what its tests share; what takes long to compile
-is kept in pytest's cache folder, for the other processes and for the next run.
+one process (`--dist loadfile`), which compiles once what its tests share.
 
 Seeds. A random test takes the `seed` fixture. It is the same in every run unless `--seed N` (or
 `--seed random`) says otherwise, and it is printed with the failure.
@@ -75,9 +74,6 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    if config.pluginmanager.hasplugin("cacheprovider"):
-        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("xla")))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     if config.getoption("--seed") == "random":
         config.option.seed = str(random.SystemRandom().randrange(2**31))
 
