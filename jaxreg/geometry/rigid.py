@@ -139,7 +139,8 @@ def rotation_angle_deg(
     Exact to the last digits near 0, where ``arccos((trace - 1) / 2)`` loses half of them.
     """
     chord = np.linalg.norm(rotation - other, axis=(-2, -1))
-    return np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
+    # numpy makes a number of an array without axes.
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1))))
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k 3 3"]:

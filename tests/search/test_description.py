@@ -103,7 +103,7 @@ def test_what_does_not_fit_is_named():
         describe(points, unit=1.0, normals=points[:8])
     with pytest.raises(ValueError, match="points must have shape"):
         describe(points[None], unit=1.0)
-    with pytest.raises(ValueError, match="the mask of points"):
+    with pytest.raises(ValueError, match="mask must be bool of shape"):
         describe(points, jnp.ones(8, bool), unit=1.0)
     one, other = (describe(points, unit=1.0, config=SearchConfig(radii=r)) for r in ((1,), (1, 2)))
     with pytest.raises(ValueError, match="describe both with the same radii"):
