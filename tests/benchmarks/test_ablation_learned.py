@@ -13,6 +13,7 @@ from research import ablation_learned
 pytestmark = pytest.mark.loose  # The network's weights are of float32.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ablation_learned.ROWS.values(), ids="-".join)
 def test_every_row_finds_the_pose_of_exact_matches(row, seed):
     rng = np.random.default_rng(seed)

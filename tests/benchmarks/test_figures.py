@@ -29,6 +29,7 @@ def test_a_registered_pair_lies_where_its_error_says(tmp_path):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
+@pytest.mark.slow
 def test_the_best_match_of_an_exact_copy_is_the_copy():
     pair = figures.sample_pair(CHAIR, PairConfig(points=400, kept=400, crop="none"), 0)
     column, good = figures.best_matches(pair, "modelnet40", "self")

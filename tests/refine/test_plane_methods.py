@@ -201,6 +201,7 @@ def test_padding_changes_nothing(method, seed):
     assert not padded_gradient[1][:9].any()
 
 
+@pytest.mark.slow
 @both
 def test_jit_and_vmap_equal_eager(method, seed):
     pairs = [make_pair(seed + i, n=30, m=30)[:2] for i in range(3)]

@@ -248,6 +248,7 @@ def test_nothing_valid_gives_the_initial_pose():
     np.testing.assert_array_equal(result.translation, np.zeros(3))
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_equal_eager():
     pairs = [make_pair(seed, n=20, noise=0.02)[:2] for seed in (13, 14, 15)]
     x, y = (jnp.asarray(np.stack(clouds)) for clouds in zip(*pairs, strict=True))

@@ -83,6 +83,7 @@ def test_implicit_gradient_is_that_of_the_solution(method, kernel, number, seed)
         np.testing.assert_allclose(np.sum(b * direction), difference, atol=1e-5 * scale)
 
 
+@pytest.mark.slow
 @each_method
 def test_implicit_gradient_goes_forward_backward_and_in_batches(method, seed):
     pairs = [make_pair(seed + number, n=40, m=50) for number in range(2)]
