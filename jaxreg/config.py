@@ -320,8 +320,13 @@ def check_options(section: str, settings: Any) -> None:
             bound += f" and at most {most:g}"
         elif most < math.inf and isinstance(value, float):
             bound += " and finite"
-        option = f"{section.replace('_', '-')}.{re.sub('_(?!$)', '-', name)}"
         raise ValueError(
             f"{section}.{name} must be {bound}, got {value}: correct it in the configuration file or "
-            f"with --{option}."
+            f"with --{option_name(f'{section}.{name}')}."
         )
+
+
+def option_name(name: str) -> str:
+    """What a command line calls a field: `train.validate_every` is `train.validate-every` there."""
+    section, dot, field = name.rpartition(".")
+    return section.replace("_", "-") + dot + re.sub(r"_(?!$)", "-", field)

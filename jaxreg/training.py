@@ -29,7 +29,6 @@ from jaxreg.network.model import Variables, init_variables, iterate
 from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
 from jaxreg.weights import checkpoint
-from jaxreg.weights.checkpoint import load_checkpoint
 from jaxreg.weights.released import check_new_name, load_pretrained, save_weights
 
 with extra("train", "training"):
@@ -83,7 +82,7 @@ def started_from(name: str, state: TrainState) -> TrainState:
     Raises:
       ValueError: there are none, or the network of `state` has other arrays.
     """
-    load = load_checkpoint if (Path(name) / "best").is_dir() else load_pretrained
+    load = checkpoint.load_checkpoint if (Path(name) / "best").is_dir() else load_pretrained
     variables, trained = load(name)
     there, here = (
         {jax.tree_util.keystr(path, simple=True, separator="/"): x.shape for path, x in leaves}

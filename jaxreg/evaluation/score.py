@@ -4,7 +4,6 @@ Networks, classical methods and transforms from another program get the same pai
 metrics.
 """
 
-import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxreg.config import Config, check_options
+from jaxreg.config import Config, check_options, option_name
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
@@ -152,13 +151,13 @@ def check_given(
 
 def option(config: Config, name: str) -> str:
     """How a command line sets a field to its value, as in `--test-pairs.outliers 200`."""
-    section, dot, field = name.rpartition(".")
+    section, _, field = name.rpartition(".")
     value = getattr(getattr(config, section) if section else config, field)
-    section, field = section.replace("_", "-") + dot, re.sub(r"_(?!$)", "-", field)
     if isinstance(value, bool):
-        return f"--{section}{'' if value else 'no-'}{field}"
+        section, dot, field = option_name(name).rpartition(".")
+        return f"--{section}{dot}{'' if value else 'no-'}{field}"
     values = value if isinstance(value, tuple) else (value,)
-    return " ".join([f"--{section}{field}", *map(str, values)])
+    return " ".join([f"--{option_name(name)}", *map(str, values)])
 
 
 def _without_effect(config: Config, name: str, method: str, transforms: str) -> str:

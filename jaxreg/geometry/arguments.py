@@ -209,11 +209,14 @@ def settings(name: str, given: Any, kind: type) -> None:
             )
 
 
-def usable(points: Array, valid: Array) -> Array:
-    """`valid`, or False everywhere if a valid point is not finite: one NaN would reach every point.
+def usable(name: str, points: Array, given: Any) -> Array:
+    """The mask of a cloud (None: every row), or False everywhere if a valid point is not finite.
 
-    What is only known in a compiled program cannot be an error, so that such a cloud counts as empty.
+    One NaN would reach every point. What is only known in a compiled program cannot be an error, so
+    that such a cloud counts as empty. Raises what `mask` raises.
     """
+    valid = mask(name, given, points.shape[0])
+    valid = jnp.ones(points.shape[0], bool) if valid is None else valid
     finite = jnp.all(jnp.isfinite(points), axis=1)
     return valid & jnp.all(finite | ~valid)
 

@@ -293,9 +293,7 @@ def _checked(cloud: PointCloud, name: str) -> PointCloud:
 def _whole(name: str, points: Any, mask: Any) -> PointCloud:
     """A cloud and its mask; without any valid point if one of them is not finite."""
     points = arguments.cloud(name, points)
-    mask = arguments.mask(f"{name}_mask", mask, points.shape[0])
-    everywhere = jnp.ones(points.shape[0], bool)
-    return PointCloud(points, arguments.usable(points, everywhere if mask is None else mask))
+    return PointCloud(points, arguments.usable(f"{name}_mask", points, mask))
 
 
 def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:

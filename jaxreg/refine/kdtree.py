@@ -112,7 +112,6 @@ def iterate(
     `step`-th point looks for a partner; large clouds first converge with fewer.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
-    widths = np.append(widths, np.ones(more, widths.dtype))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
     stride = max(stride, step)
     levels = [(stride, widths)]
@@ -143,7 +142,8 @@ def iterate(
             pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + config.iterations) // 2, config.iterations - 1)
-            if change > _FAR and spare > 0:
+            moving = change > _FAR or (i == len(widths) - 1 and not still)
+            if moving and spare > 0:
                 spare -= 1
             else:
                 i = max(i + 1, halfway) if still else i + 1

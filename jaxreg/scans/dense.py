@@ -69,8 +69,9 @@ def agreement(
     The pose maps the centred source to the centred reference, both in the unit of the input.
     """
     some, noise = _sampled(source)
-    patches = _patches(reference, scale * some @ pose.rotation.T + pose.translation)
-    off, beside = _offsets(scale * some @ pose.rotation.T + pose.translation, patches)
+    moved = scale * some @ pose.rotation.T + pose.translation
+    patches = _patches(reference, moved)
+    off, beside = _offsets(moved, patches)
     noise = np.hypot(scale * noise, patches.noise)
     noise = np.maximum(noise, _STEP * np.median(patches.width))
     over = _over(off, beside, patches, noise)

@@ -317,24 +317,26 @@ def _refine(problem: Problem, pose: RigidTransform) -> Refined:
 
 def _another_cause(problem: Problem, pose: RigidTransform) -> str:
     """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
-    source, reference, length = problem.source, problem.reference, float(problem.where.length)
-    pose = RigidTransform(pose.rotation, pose.translation * length)
+    source, reference, config = problem.source, problem.reference, problem.config
+    pose = _lengthened(pose, problem.where)
     now = dense.agreement(source, reference, pose)
     if not now.suspicious:
         return ""
-    reach = problem.distance * length
+    reach = problem.distance * float(problem.where.length)
     scale, then = dense.at_another_size(source, reference, pose, reach)
     if told := dense.size_text(scale, now, then):
         return told
-    config = problem.config
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
     twin = pose_problem(mirrored, reference, config)
-    other = _refine(twin, _search(twin, None).pose).transform
-    length = float(twin.where.length)
-    other = RigidTransform(other.rotation, other.translation * length)
+    other = _lengthened(_refine(twin, _search(twin, None).pose).transform, twin.where)
     if dense.agreement(mirrored, reference, other).explains(now):
         return "The mirrored source fits better."
     return ""
+
+
+def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
+    """A pose in the frame as one of the centred clouds in the unit of the input."""
+    return RigidTransform(pose.rotation, pose.translation * float(where.length))
 
 
 def _result(problem: Problem, refined: Refined, found: _Found, cause: str) -> ScanRegistration:

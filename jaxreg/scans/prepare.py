@@ -273,7 +273,7 @@ def _strays(
     told = f"{name}: {stray_points.told(points, far)}"
     if wanted == "raise":
         raise ValueError(f"{told}: remove them, or pass strays='drop' or strays='keep'.")
-    return far, (f"{told}" + ("; left out" if wanted == "drop" else ""),)
+    return far, (told + ("; left out" if wanted == "drop" else ""),)
 
 
 def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k: int) -> Level:

@@ -14,7 +14,7 @@ from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
 from jaxreg.search.config import SearchConfig
-from jaxreg.search.description import describe
+from jaxreg.search.description import Described, describe
 from jaxreg.search.learned import Network
 from jaxreg.search.nearest import nearest_packed
 from jaxreg.search.ranking import NEAR_WIDTH, sparsity_factor
@@ -58,23 +58,15 @@ def register_global(
         the similarity has another shape or dtype, `max_angle` is not in (0, pi], or `network` was
         trained for other radii.
     """
-    arguments.settings("config", config, SearchConfig)
-    source, reference = arguments.clouds(source, reference)
-    source_mask = _usable("source_mask", source, source_mask)
-    reference_mask = _usable("reference_mask", reference, reference_mask)
-    where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
-    described = (
-        describe(x, source_mask, unit=1.0, config=config),
-        describe(y, reference_mask, unit=1.0, config=config),
-    )
+    where, clouds, described = _described(source, reference, source_mask, reference_mask, config)
     found = search_described(
         *described, network=network, similarity=similarity, max_angle=max_angle, config=config
     )
     sparsity = sparsity_factor(described[0].spacing, described[1].spacing)
     start = jax.tree.map(lambda leaf: leaf[0], found.poses)
-    pose = _refined((x, y), (source_mask, reference_mask), start, sparsity, config.final)
     masks = described[0].mask, described[1].mask
-    return _registration(where, pose, (x, y), masks, found.score[0])
+    pose = _refined(clouds, masks, start, sparsity, config.final)
+    return _registration(where, pose, clouds, masks, found.score[0])
 
 
 def search_poses(
@@ -93,16 +85,11 @@ def search_poses(
 
     `also`: one more pose to try. Poses that turn by more than `max_angle` (radians) are not allowed.
     """
-    arguments.settings("config", config, SearchConfig)
-    source, reference = arguments.clouds(source, reference)
-    source_mask = _usable("source_mask", source, source_mask)
-    reference_mask = _usable("reference_mask", reference, reference_mask)
-    where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
+    where, _, described = _described(source, reference, source_mask, reference_mask, config)
     if also is not None:
         also = frame.transform_in(where, arguments.transform("also", also))
     found = search_described(
-        describe(x, source_mask, unit=1.0, config=config),
-        describe(y, reference_mask, unit=1.0, config=config),
+        *described,
         network=network,
         similarity=similarity,
         also=also,
@@ -112,9 +99,22 @@ def search_poses(
     return found._replace(poses=jax.vmap(lambda p: frame.transform_out(where, p))(found.poses))
 
 
-def _usable(name: str, points: Array, mask: Array | None) -> Array:
-    mask = arguments.mask(name, mask, points.shape[0])
-    return arguments.usable(points, jnp.ones(points.shape[0], bool) if mask is None else mask)
+def _described(
+    source: Array,
+    reference: Array,
+    source_mask: Array | None,
+    reference_mask: Array | None,
+    config: SearchConfig,
+) -> tuple[frame.Frame, tuple[Array, Array], tuple[Described, Described]]:
+    """The frame of two checked clouds, their points in it, and what the search compares."""
+    arguments.settings("config", config, SearchConfig)
+    source, reference = arguments.clouds(source, reference)
+    source_mask = arguments.usable("source_mask", source, source_mask)
+    reference_mask = arguments.usable("reference_mask", reference, reference_mask)
+    where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
+    one = describe(x, source_mask, unit=1.0, config=config)
+    other = describe(y, reference_mask, unit=1.0, config=config)
+    return where, (x, y), (one, other)
 
 
 def enter(

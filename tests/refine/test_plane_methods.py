@@ -14,12 +14,7 @@ from jaxreg.geometry import rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import RigidTransform
 from tests.compiled import gicp, point_to_plane
-
-KERNELS = (
-    "none",
-    "geman_mcclure",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("huber", "cauchy", "gaussian")),
-)
+from tests.refine.kernels import KERNELS
 
 METHODS = {"point_to_plane": point_to_plane, "gicp": gicp}
 both = pytest.mark.parametrize("method", METHODS)

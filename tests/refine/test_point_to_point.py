@@ -15,12 +15,7 @@ from jaxreg.geometry.arguments import clouds
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import RigidTransform
 from tests.compiled import icp
-
-KERNELS = (
-    "none",
-    "geman_mcclure",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("huber", "cauchy", "gaussian")),
-)
+from tests.refine.kernels import KERNELS
 
 plain = partial(RefineConfig, kernel="none")
 
