@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxreg.scans import summary
-from jaxreg.scans.pair import ScanRegistration
+from jaxreg.scans.pair import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000
@@ -31,7 +31,7 @@ def write_registration_page(
 ) -> None:
     """Write an HTML page: both clouds, a before/after switch, confidence colours, numbers, verdict.
 
-    Points that are not finite are left out. Large clouds are thinned evenly for display.
+    Where other poses may be right, one can step through them. Points that are not finite are left out. Large clouds are thinned evenly for display.
     """
     rows = shown_rows(source)
     origin = _middle(reference)
@@ -43,7 +43,7 @@ def write_registration_page(
     ]
     content = {
         "clouds": clouds,
-        "motion": _motion(result, source[rows], origin, shift),
+        "motions": _motions(result, source[rows], origin, shift),
         "figures": [[name, value] for name, value in summary.figures(result).items()],
         "verdict": {"text": summary.verdict_line(result), "good": result.success},
     }
@@ -61,7 +61,7 @@ def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]])
         [name, " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))]
         for name, points in clouds.items()
     ]
-    _write(path, ", ".join(clouds), {"clouds": shown, "motion": None, "figures": sizes})
+    _write(path, ", ".join(clouds), {"clouds": shown, "motions": [], "figures": sizes})
 
 
 def draw_registration(
@@ -143,16 +143,28 @@ def brought_near(
     return np.zeros(3) if distance <= 1.5 * near else way * (near / distance - 1)
 
 
-def _motion(
+def _motions(
     result: ScanRegistration, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
+) -> list[dict[str, Any]]:
+    """The pose found, then its alternatives, each with its probability."""
+    poses = [Alternative(result.transform, result.probability), *result.alternatives]
+    return [
+        {"probability": f"{pose.probability:.2f}"}
+        | _motion(pose.transform, source, origin, shift)
+        for pose in poses
+    ]
+
+
+def _motion(
+    pose: RigidTransform, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
 ) -> dict[str, Any]:
     """The motion as a turn about the source's centroid and the path of that centroid.
 
     The page shows the source shifted before the motion, and ends where the motion ends.
     """
-    axis, angle = summary.axis_angle(result.rotation)
+    axis, angle = summary.axis_angle(pose.rotation)
     centre = source.mean(axis=0)
-    before, after = centre + shift, result.rotation @ centre + result.translation
+    before, after = centre + shift, pose.rotation @ centre + pose.translation
     ways = {"before": (before - origin).tolist(), "after": (after - origin).tolist()}
     return {"axis": axis.tolist(), "angle": angle, "shortened": bool(shift.any())} | ways
 
