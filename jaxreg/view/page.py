@@ -149,8 +149,7 @@ def _motions(
     """The pose found, then its alternatives, each with its probability."""
     poses = [Alternative(result.transform, result.probability), *result.alternatives]
     return [
-        {"probability": f"{pose.probability:.2f}"}
-        | _motion(pose.transform, source, origin, shift)
+        {"probability": f"{pose.probability:.2f}"} | _motion(pose.transform, source, origin, shift)
         for pose in poses
     ]
 
