@@ -46,6 +46,7 @@ from .types import GlobalRegistration as GlobalRegistration
 
 # The paper's network
 from .config import LossConfig as LossConfig, ModelConfig as ModelConfig
+from .network.batch import register_batch as register_batch
 from .network.model import init_variables as init_variables, register_pair as register_pair
 from .peers.rienet import load_rienet as load_rienet
 from .types import Registration as Registration

@@ -31,7 +31,8 @@ def write_registration_page(
 ) -> None:
     """Write an HTML page: both clouds, a before/after switch, confidence colours, numbers, verdict.
 
-    Where other poses may be right, one can step through them. Points that are not finite are left out. Large clouds are thinned evenly for display.
+    Where other poses may be right, one can step through them. Points that are not finite are left
+    out. Large clouds are thinned evenly for display.
     """
     rows = shown_rows(source)
     origin = _middle(reference)
