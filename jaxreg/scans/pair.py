@@ -319,7 +319,7 @@ def _another_cause(problem: Problem, pose: RigidTransform) -> str:
     """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
     source, reference, config = problem.source, problem.reference, problem.config
     pose = _lengthened(pose, problem.where)
-    now = dense.agreement(source, reference, pose)
+    now = dense.at_a_glance(source, reference, pose)
     if not now.suspicious:
         return ""
     reach = problem.distance * float(problem.where.length)
