@@ -70,7 +70,8 @@ def agreement(
 ) -> Agreement:
     """How well `source`, times `scale` about its centre and then moved by `pose`, fits `reference`.
 
-    `count` of its points are compared. The pose maps the centred source to the centred reference, both in the unit of the input.
+    `count` of its points are compared. The pose maps the centred source to the centred reference, both
+    in the unit of the input.
     """
     some, noise = _sampled(source, count)
     moved = scale * some @ pose.rotation.T + pose.translation
