@@ -56,6 +56,13 @@ from .weights.released import (
     load_pretrained as load_pretrained,
 )
 
+# Programs in files
+from .exported import (
+    ExportedProgram as ExportedProgram,
+    export_program as export_program,
+    load_exported as load_exported,
+)
+
 # Two scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud
 from .scans.config import RegisterConfig as RegisterConfig

@@ -28,6 +28,7 @@ HOST |= {
 HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training.train"}
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
+HOST |= {"network.batch.register_batch", "exported.export_program", "exported.load_exported"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
 """Transformed in their own tests: test_batching.py, data/test_pairs.py and test_training.py."""
