@@ -55,6 +55,15 @@ from .weights.released import (
     load_pretrained as load_pretrained,
 )
 
+# Other learned methods
+from .config import (
+    CEMNetConfig as CEMNetConfig,
+    DCPConfig as DCPConfig,
+    IDAMConfig as IDAMConfig,
+    RPMNetConfig as RPMNetConfig,
+)
+from . import peers as peers
+
 # Two scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud
 from .scans.config import RegisterConfig as RegisterConfig

@@ -153,26 +153,6 @@ class RPMNetConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class FMRConfig:
-    """Feature-metric registration (Huang, Mei and Zhang, 2020)."""
-
-    channels: tuple[int, ...] = (64, 64, 64, 128, 1024)
-    """Widths of the encoder's layers; the last is that of the feature of a cloud."""
-    decoder: tuple[int, ...] = (1024, 512, 256)
-    """Widths of the decoder's layers."""
-    decoded: int = 2048
-    """Points that the decoder makes."""
-    iterations: int = 10
-    """Gauss-Newton steps."""
-    step: float = 0.01
-    """Start of the six learned steps of the finite differences (radians; the unit of the clouds)."""
-    pose: float = 1.0
-    """Weight of the error of the pose in training; 0 is the unsupervised loss."""
-    bn_momentum: float = 0.9
-    """Share of the old running statistics that BatchNorm keeps at a training step."""
-
-
-@dataclasses.dataclass(frozen=True)
 class LossConfig:
     """The four losses of Eq. 14-18, summed over points, averaged over pairs."""
 
@@ -304,13 +284,12 @@ class Config:
     differs."""
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
-    network: Literal["paper", "dcp", "cemnet", "idam", "rpmnet", "fmr"] = "paper"
+    network: Literal["paper", "dcp", "cemnet", "idam", "rpmnet"] = "paper"
     """The method: the paper's, set up by `model`, or another one, set up by the section of its name."""
     dcp: DCPConfig = DCPConfig()
     cemnet: CEMNetConfig = CEMNetConfig()
     idam: IDAMConfig = IDAMConfig()
     rpmnet: RPMNetConfig = RPMNetConfig()
-    fmr: FMRConfig = FMRConfig()
     weights: str = ""
     """Released weights that `jaxreg evaluate` uses when no checkpoint is given."""
 
@@ -419,13 +398,12 @@ _LEAST = {
     "rpmnet": dict.fromkeys(
         ("neighbors", "width", "hidden", "k_normals", "iterations", "train_iterations"), 1
     ),
-    "fmr": dict.fromkeys(("channels", "decoder", "decoded", "iterations"), 1),
     "pairs": {"points": 1, "kept": 1},
     "data": dict.fromkeys(("train_shapes", "test_shapes", "train_draws", "test_draws"), 1),
     "train": {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1},
 }
 """The smallest allowed value of these settings; other numbers must not be negative."""
-_POSITIVE = ("learning_rate", "clip", "beta", "epsilon", "radius", "step")
+_POSITIVE = ("learning_rate", "clip", "beta", "epsilon", "radius", "match_distance")
 _SHARES = ("bn_momentum", "ema", "exploration", "future", "test_share", "validation_share")
 _LIMITS = {"clip": math.inf, "rotation_max_deg": 360.0} | dict.fromkeys(_SHARES, 1.0)
 
