@@ -5,8 +5,8 @@ cross-entropy method candidates are drawn from the distribution, scored on the c
 of them, the elites, make the next distribution. A pose is six numbers: Euler angles about z, y and
 x with ``R = Rx Ry Rz``, and t.
 
-It does better than it should on clouds that overlap in part, since a point far from the other
-cloud counts nothing; but a wrong pose of a symmetric shape scores as well as the right one.
+Clouds may overlap in part, since a point far from the other cloud counts nothing; but a wrong pose of
+a symmetric shape scores as well as the right one.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from jaxreg.config import CEMNetConfig, Config
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import nearest_in, squared_distances
-from jaxreg.geometry.numerics import safe_norm, safe_sqrt
+from jaxreg.geometry.numerics import leading_max, safe_norm, safe_sqrt
 from jaxreg.geometry.procrustes import weighted_procrustes
 from jaxreg.io.arrays import read_arrays
 from jaxreg.network.features import DGCNN, BatchNorm
@@ -35,6 +35,8 @@ _BN_MOMENTUM = 0.9
 _ICP_STEPS = 3
 _WIDE = (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 """Standard deviation of the exploration: radians, and units of the unit sphere."""
+_LOCKED = 64
+"""Cosine of the angle about y, in roundings, at which the other two angles are one."""
 _FAR = 1e30
 _LANES = 131072
 """Points that are compared with the other cloud at once; with fewer XLA uses one core only."""
@@ -132,7 +134,7 @@ def sampling_network(
     transform = weighted_procrustes(source.points, copy, weights)
     # Features are not negative: zero leaves the maximum of the valid points as it is.
     pooled = [
-        jnp.max(jnp.where(cloud.mask[:, None], x, 0), axis=0)
+        leading_max(jnp.where(cloud.mask[:, None], x, 0))
         for x, cloud in zip(features, (source, reference), strict=True)
     ]
     sigma = networks[1].apply(own[1], jnp.concatenate(pooled), train=False)
@@ -144,17 +146,23 @@ def _networks(config: CEMNetConfig) -> tuple[DGCNN, _SamplingNetwork]:
 
 
 def numbers_of(transform: RigidTransform) -> Float[Array, "6"]:
-    """Angles about z, y and x with ``R = Rx Ry Rz``, y in [-pi/2, pi/2], and t."""
+    """Angles about z, y and x with ``R = Rx Ry Rz``, y in [-pi/2, pi/2], and t.
+
+    Where y is a right angle only one angle is left of the other two: then z is 0, and constant.
+    """
     r = transform.rotation
     flat = safe_norm(r[0, :2])
-    angles = _arctan2(-r[0, 1], r[0, 0]), _arctan2(r[0, 2], flat), _arctan2(-r[1, 2], r[2, 2])
-    return jnp.concatenate([jnp.stack(angles), transform.translation])
+    locked = flat <= _LOCKED * jnp.finfo(r.dtype).eps
 
+    def angle(sine, cosine, kept=True):
+        usable = kept & ((sine != 0) | (cosine != 0))
+        sine, cosine = jnp.where(usable, sine, 0), jnp.where(usable, cosine, 1)
+        return jnp.arctan2(sine, cosine)
 
-def _arctan2(y: Float[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
-    """The angle of (x, y), 0 for (0, 0), where it has a derivative of 0 as well."""
-    nothing = (x == 0) & (y == 0)
-    return jnp.where(nothing, 0, jnp.arctan2(y, jnp.where(nothing, 1, x)))
+    about_z = angle(-r[0, 1], r[0, 0], ~locked)
+    about_x = angle(-r[1, 2], r[2, 2], ~locked) + angle(r[1, 0] * r[0, 2], r[1, 1], locked)
+    about_y = angle(r[0, 2], flat)
+    return jnp.concatenate([jnp.stack([about_z, about_y, about_x]), transform.translation])
 
 
 def pose_of(numbers: Float[Array, "6"]) -> RigidTransform:
@@ -256,8 +264,10 @@ def alignment_error(
 ) -> Float[Array, "c"]:
     """``2 - (consensus of the source with the reference, and of the reference with the source)``.
 
-    Of every one of many poses (c, 3, 3), (c, 3); `few` are the points that count.
+    Of every one of many poses (c, 3, 3), (c, 3); `few` are the points that count. A constant of the
+    derivative.
     """
+    poses, few, source, reference = jax.lax.stop_gradient((poses, few, source, reference))
     moved = _moved(poses, few[0].points)
     back = _moved(rigid.inverse(poses), few[1].points)
     there = _maximum_consensus(_nearest(moved, reference), few[0].mask, epsilon)

@@ -205,7 +205,7 @@ def hard_elimination(
     rows = jax.lax.optimization_barrier(jax.lax.top_k(score, size)[1])
     valid = jnp.sum(mask, dtype=jnp.int32)
     count = jnp.where(valid > 0, jnp.maximum(valid // one_in, 1), 0)
-    return rows, jnp.arange(size) < count
+    return rows, jnp.arange(size, dtype=jnp.int32) < count
 
 
 def _steps(variables: Variables, source: Kept, reference: Kept, *, config, train: bool):

@@ -37,6 +37,15 @@ def test_six_numbers_are_scipy_s_angles_and_back(seed):
     np.testing.assert_allclose(cemnet.numbers_of(pose), numbers, atol=1e-12)
 
 
+@pytest.mark.parametrize("right_angle", [90, -90])
+def test_two_angles_that_are_one_give_the_same_rotation(right_angle):
+    rotation = Rotation.from_euler("XYZ", [25, right_angle, 40], degrees=True).as_matrix()
+    pose = RigidTransform(jnp.asarray(rotation), jnp.zeros(3))
+    np.testing.assert_allclose(
+        cemnet.pose_of(cemnet.numbers_of(pose)).rotation, rotation, atol=1e-12
+    )
+
+
 def test_sparsemax_is_the_nearest_point_of_the_simplex(seed):
     scores = np.random.default_rng(seed).normal(size=6)
     constraint = {"type": "eq", "fun": lambda p: p.sum() - 1}

@@ -95,7 +95,7 @@ def test_features_are_those_of_the_layers(seed):
     rng = np.random.default_rng(seed)
     variables = draw_variables(idam, SMALL["idam"], rng)
     points = rng.normal(size=(9, 3))
-    near = np.array([[i, (i + 1) % 9, (i + 4) % 9] for i in range(9)], np.int32)
+    near = jnp.array([[i, (i + 1) % 9, (i + 4) % 9] for i in range(9)], jnp.int32)
     own = {kind: tree["graph"] for kind, tree in variables.items()}
     network = idam._networks(SMALL["idam"])["graph"]
     run = jax.jit(lambda x: network.apply(own, x, near, jnp.ones(9, bool), train=False))

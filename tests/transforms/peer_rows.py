@@ -95,7 +95,7 @@ def peer_rows() -> dict[str, Row]:
             ((np.ones((9, 6)), np.zeros(9)),),
             smooth=False,
         ),
-        "peers.cemnet.alignment_error": Row(score, (poses(), source, moved)),
+        "peers.cemnet.alignment_error": Row(score, (poses(), source, moved), smooth=False),
         "peers.idam.distance_augmented": Row(
             idam.distance_augmented, (kept(), kept()), ((kept(),) * 2,)
         ),
