@@ -63,6 +63,15 @@ from .exported import (
     load_exported as load_exported,
 )
 
+# Other learned methods
+from .config import (
+    CEMNetConfig as CEMNetConfig,
+    DCPConfig as DCPConfig,
+    IDAMConfig as IDAMConfig,
+    RPMNetConfig as RPMNetConfig,
+)
+from . import peers as peers
+
 # Two scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud
 from .scans.config import RegisterConfig as RegisterConfig

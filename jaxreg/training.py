@@ -25,7 +25,8 @@ from jaxreg.geometry import rigid
 from jaxreg.io.log import read_metrics
 from jaxreg.network.features import BATCH_AXIS
 from jaxreg.network.losses import pose_error, step_losses, total_loss
-from jaxreg.network.model import Variables, init_variables, iterate
+from jaxreg.network.model import Variables, iterate
+from jaxreg.peers import by_name
 from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
 from jaxreg.weights import checkpoint
@@ -70,7 +71,7 @@ def create_optimizer(config: TrainConfig) -> optax.GradientTransformation:
 def create_train_state(config: Config) -> TrainState:
     """The state before the first step; one program, because operation by operation it takes 300 MB."""
     key = jax.random.fold_in(key_of(config.train.seed), _INIT)
-    variables = init_variables(key, config.model)
+    variables = by_name.init_variables(key, config)
     optimizer = create_optimizer(config.train).init(variables["params"])
     average = jax.tree.map(jnp.copy, variables)  # A donated buffer must not appear twice.
     return TrainState(jnp.zeros((), jnp.int32), variables, average, optimizer)
@@ -92,8 +93,9 @@ def started_from(name: str, state: TrainState) -> TrainState:
         odd = min(part for part, _ in there.items() ^ here.items())
         raise ValueError(
             f"the weights '{name}' do not fit the network of the configuration ({odd}: "
-            f"{there.get(odd, 'none')} there, {here.get(odd, 'none')} here): train with the [model] of "
-            f"these weights, {trained.model}."
+            f"{there.get(odd, 'none')} there, {here.get(odd, 'none')} here): train with network = "
+            f"'{trained.network}' and the settings of these weights, "
+            f"{trained.model if trained.network == 'paper' else getattr(trained, trained.network)}."
         )
     variables, average = (
         jax.tree.map(lambda x, like: jnp.array(x, like.dtype), variables, state.variables)
@@ -108,8 +110,13 @@ def batch_loss(
     """Mean loss of a batch of pairs, its terms by name, and the updated BatchNorm statistics.
 
     Only the two clouds of each pair are read, and never its transform, unless `config.loss.pose`
-    asks for it.
+    asks for it, or `config.network` is a peer that learns from the pose.
     """
+
+    def peer_loss(source, reference, truth):
+        variables = {"params": params, "batch_stats": statistics}
+        loss, terms, variables = by_name.loss(variables, source, reference, truth, config=config)
+        return loss, terms, variables["batch_stats"]
 
     def pair_loss(source, reference, truth):
         variables = {"params": params, "batch_stats": statistics}
@@ -131,7 +138,8 @@ def batch_loss(
         loss = loss + sum(config.loss.pose * error for error in posed.values())
         return loss, terms._asdict() | posed, variables["batch_stats"]
 
-    loss, terms, statistics = jax.vmap(pair_loss, axis_name=BATCH_AXIS, out_axes=(0, 0, None))(
+    one = pair_loss if config.network == "paper" else peer_loss
+    loss, terms, statistics = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))(
         pairs.source, pairs.reference, pairs.transform
     )
     return jnp.mean(loss), (jax.tree.map(jnp.mean, terms), statistics)
@@ -181,7 +189,7 @@ def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[s
         config=config.test_pairs,
         batch=config.train.batch,
     )
-    method = network_method(variables, config.model)
+    method = network_method(variables, config)
     predicted, truth, _ = evaluate_method(method, batches)
     metrics = evaluate_transforms(predicted, truth)
     return {
@@ -213,7 +221,13 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
       FloatingPointError: the loss is not finite; the message says at which step. Saved checkpoints
         stay.
     """
-    for section in ("model", "loss", "pairs", "test_pairs", "data", "train"):
+    if config.network not in by_name.TRAINED:
+        raise ValueError(
+            f"network = '{config.network}' is not trained here: evaluate the weights of its authors, "
+            f"or train one of {', '.join(by_name.TRAINED)}."
+        )
+    own = "model" if config.network == "paper" else config.network
+    for section in (own, "loss", "pairs", "test_pairs", "data", "train"):
         check_options(section, getattr(config, section))
     checkpoint.check_place(workdir)
     shapes, held_out = load_training(

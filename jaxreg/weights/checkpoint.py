@@ -18,7 +18,8 @@ from flax.traverse_util import flatten_dict
 from jaxreg import config as configuration
 from jaxreg._extras import extra
 from jaxreg.config import Config
-from jaxreg.network.model import Variables, init_variables
+from jaxreg.network.model import Variables
+from jaxreg.peers.by_name import init_variables
 
 try:
     import fcntl
@@ -288,7 +289,7 @@ def load_checkpoint(workdir: str | Path) -> tuple[Variables, Config]:
 def load_best(workdir: str | Path) -> tuple[Variables, Config, int]:
     """The same, and the step. The optimiser's state is not read: other versions may change it."""
     config, _ = best_config(workdir)
-    average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config.model))
+    average = jax.eval_shape(lambda: init_variables(jax.random.key(0), config))
     step = jax.ShapeDtypeStruct((), jnp.int32)
     best = restore_best(workdir, {"step": step, "average": average})
     return jax.tree.map(jnp.asarray, best["average"]), config, int(best["step"])

@@ -89,6 +89,8 @@ def test_all_that_the_library_has_is_in_the_list():
         ("weights:magic", "modelnet40_first20"),
         ("checkpoint:nowhere", "no checkpoint in nowhere"),
         ("rienet:nowhere.npz", "nowhere.npz"),
+        ("dcp:nowhere.npz", "nowhere.npz: no such file; give the .npz of DCP's"),
+        ("cemnet:nowhere.npz", "nowhere.npz: no such file; give the .npz of CEMNet's"),
     ],
 )
 def test_a_wrong_name_says_what_there_is(name, message):
@@ -134,6 +136,14 @@ def test_rienet_is_a_method(pair, peers_root):
     outcome = methods.choose(name).clouds(pair.source.points, pair.reference.points)
     assert angle_deg(outcome.transform, pair.transform) < 0.1
     assert methods.trained_config(name).model.inlier_network == "rienet"
+
+
+@pytest.mark.peers
+def test_a_peer_is_a_method(pair, peers_root):
+    name = f"dcp:{peers_root / 'dcp_v1.npz'}"
+    outcome = methods.choose(name).clouds(pair.source.points, pair.reference.points)
+    assert angle_deg(outcome.transform, pair.transform) < 5
+    assert methods.trained_config(name).network == "dcp"
 
 
 def test_only_networks_have_a_configuration_of_their_training():
