@@ -169,11 +169,25 @@ def register(
     config = RegisterConfig() if config is None else config
     _check_options(max_rotation_deg, config)
     start = None if initial is None else check_pose(initial, "initial")
-    problem = pose_problem(
+    return register_prepared(
         _prepared(source, "source", nonfinite, strays, config),
         _prepared(reference, "reference", nonfinite, strays, config),
         config,
+        start=start,
+        max_rotation_deg=max_rotation_deg,
     )
+
+
+def register_prepared(
+    source: Prepared,
+    reference: Prepared,
+    config: RegisterConfig,
+    *,
+    start: RigidTransform | None = None,
+    max_rotation_deg: float | None = None,
+) -> ScanRegistration:
+    """`register` of clouds that were prepared with `config`, or with one that differs in `wide` only."""
+    problem = pose_problem(source, reference, config)
     if start is None:
         found = _search(problem, max_rotation_deg)
     else:
