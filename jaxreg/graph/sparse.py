@@ -192,7 +192,7 @@ def _levenberg(problem: _Problem, poses, weights, iterations: int, tolerance: fl
     for taken in range(1, iterations + 1):
         matrix, gradient = _assembled(problem, edge_equations(graph, poses, weights))
         while True:
-            new = retract(poses, _solved(problem, matrix, gradient, damping))
+            new = retract(poses, _step(problem.structure, matrix, gradient, damping))
             new_cost = float(np.sum(weights * squared_errors(graph, new)))
             if new_cost <= cost * (1 + 1e-12):
                 break
@@ -206,22 +206,39 @@ def _levenberg(problem: _Problem, poses, weights, iterations: int, tolerance: fl
     return poses, iterations, False
 
 
+def gauss_newton_steps(
+    graph: PoseGraph, fixed: Bool[np.ndarray, "n"], equations: EdgeEquations, damping: float = 1e-9
+) -> Float[np.ndarray, "n 6"]:
+    """The step of every pose for equations of any cost that is a sum over the edges of a graph.
+
+    Only `source`, `reference` and `mask` of the graph are read. `damping` is in units of the diagonal.
+    """
+    lonely = np.ones(len(fixed), bool)
+    lonely[graph.source[graph.mask]] = lonely[graph.reference[graph.mask]] = False
+    structure = _structure(graph, fixed | lonely)
+    matrix, gradient = _sums(graph, structure, equations, len(fixed))
+    return _step(structure, matrix, gradient, damping)
+
+
 def _assembled(problem: _Problem, equations: EdgeEquations):
+    return _sums(problem.graph, problem.structure, equations, len(problem.start.translation))
+
+
+def _sums(graph: PoseGraph, where: _Structure, equations: EdgeEquations, count: int):
     """``H`` in the order of elimination, and ``g`` by node."""
-    where, graph = problem.structure, problem.graph
-    gradient = np.zeros((len(problem.start.translation), 6))
+    gradient = np.zeros((count, 6))
     for index, slope in zip((graph.source, graph.reference), equations.gradient, strict=True):
         np.add.at(gradient, index, slope)
     coupling = equations.coupling
     blocks = np.concatenate([*equations.diagonal, coupling, coupling.swapaxes(1, 2)])
     summed = np.add.reduceat(blocks[where.order], where.starts, axis=0)
-    count = 6 * len(where.free)
-    matrix = sparse.bsr_matrix((summed, where.indices, where.indptr), shape=(count, count))
+    size = 6 * len(where.free)
+    matrix = sparse.bsr_matrix((summed, where.indices, where.indptr), shape=(size, size))
     return matrix.tocsc(), gradient
 
 
-def _solved(problem: _Problem, matrix, gradient: np.ndarray, damping: float) -> np.ndarray:
-    step, free = np.zeros_like(gradient), problem.structure.free
+def _step(where: _Structure, matrix, gradient: np.ndarray, damping: float) -> np.ndarray:
+    step, free = np.zeros_like(gradient), where.free
     if len(free):
         found = _factors(matrix, damping).solve(-gradient[free].ravel())
         step[free] = found.reshape(-1, 6)

@@ -168,7 +168,7 @@ def register_many(
         steps: tuple[JointRefinement, ...] = ()
         if joint and placement.group.max(initial=-1) >= 0:
             report(len(run.relations), len(run.relations), "joint refinement")
-            placement, steps = refine_jointly(placement, run.relations, prepared, config)
+            placement, steps = refine_jointly(placement, run.relations, prepared)
     return _alignment(placement, run, steps)
 
 
