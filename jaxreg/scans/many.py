@@ -59,7 +59,7 @@ class Alignment:
     placed. `groups` are the scans that hang together, the largest group first; between groups nothing
     is known. `probability[k]` is the chance that the pose is right in its group (0 if not placed),
     `covariance[k]` that of a small rotation vector (rad) and translation about the scan's centre, in
-    the axes of the group, relative to the group's first scan. `pairs` are the registrations that were
+    the axes of the group, relative to the group's first scan; `centres` are these centres. `pairs` are the registrations that were
     made, used ones and refused ones, `reasons[k]` says why a scan is not placed (empty if it is).
     `steps` tell what the joint refinement gained. `success` is True if all scans are in one group.
     """
@@ -69,6 +69,7 @@ class Alignment:
     groups: tuple[tuple[int, ...], ...]
     probability: Float[np.ndarray, "n"]
     covariance: Float[np.ndarray, "n 6 6"]
+    centres: Float[np.ndarray, "n 3"]
     pairs: tuple[Pair, ...]
     reasons: tuple[str, ...]
     steps: tuple[JointRefinement, ...]
@@ -492,7 +493,7 @@ def _alignment(placement: Placement, run: _Run, steps) -> Alignment:
     notes = tuple(note for cloud in run.prepared for note in cloud.notes)
     return Alignment(
         placement.poses.rotation, placement.poses.translation, placement.members(),
-        placement.probability, placement.covariance, pairs, reasons, steps, notes,
+        placement.probability, placement.covariance, run.sizes.centre, pairs, reasons, steps, notes,
     )  # fmt: skip
 
 
