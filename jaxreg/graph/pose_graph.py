@@ -42,13 +42,14 @@ class EdgeEquations(NamedTuple):
 
 
 def residuals(graph: PoseGraph, poses: RigidTransform) -> Float[Any, "e 6"]:
-    """``log(Z^-1 X_r^-1 X_s)`` of every edge."""
+    """``log(Z^-1 X_r^-1 X_s)`` of every edge; of masked ones as if ``Z`` were the identity."""
+    graph = _cleaned(graph)
     return se3.log(se3.between(graph.transform, _measured(graph, poses)))
 
 
 def squared_errors(graph: PoseGraph, poses: RigidTransform) -> Float[Any, "e"]:
     """``e^T Omega e`` of every edge: of right ones distributed as chi squared with 6 degrees."""
-    error = residuals(graph, poses)
+    error, graph = residuals(graph, poses), _cleaned(graph)
     xp = se3.module_of(error)
     return xp.where(graph.mask, xp.sum(error * se3.applied(graph.information, error), axis=-1), 0)
 
@@ -57,6 +58,7 @@ def edge_equations(
     graph: PoseGraph, poses: RigidTransform, weights: Float[Any, "e"]
 ) -> EdgeEquations:
     """What every edge adds to the normal equations of a Gauss-Newton step at `poses`."""
+    graph = _cleaned(graph)
     xp = se3.module_of(graph.information)
     measured = _measured(graph, poses)
     error = se3.log(se3.between(graph.transform, measured))
@@ -94,6 +96,20 @@ def truncated_weights(
     safe = xp.maximum(squared, low)
     between = xp.sqrt(threshold * control * (control + 1) / safe) - control
     return xp.where(squared <= low, 1.0, xp.where(squared >= high, 0.0, between))
+
+
+def _cleaned(graph: PoseGraph) -> PoseGraph:
+    """Unit matrices where an edge is masked: what stands there may be NaN."""
+    xp, mask = se3.module_of(graph.information), graph.mask[:, None, None]
+    eyes = (xp.eye(n, dtype=graph.information.dtype)[None] for n in (3, 6))
+    rotation, information = (
+        xp.where(mask, part, eye)
+        for part, eye in zip((graph.transform.rotation, graph.information), eyes, strict=True)
+    )
+    translation = xp.where(graph.mask[:, None], graph.transform.translation, 0)
+    return graph._replace(
+        transform=RigidTransform(rotation, translation), information=information
+    )
 
 
 def _measured(graph: PoseGraph, poses: RigidTransform) -> RigidTransform:

@@ -37,7 +37,7 @@ def exp(twist: Float[Any, "*b 6"]) -> RigidTransform:
     )
     once = xp.cross(omega, v)
     cross = skew(omega)
-    turn = xp.eye(3, dtype=twist.dtype) + sine[..., None] * cross
+    turn = _eye(cross) + sine[..., None] * cross
     turn = turn + first[..., None] * product(cross, cross)
     return RigidTransform(turn, v + first * once + second * xp.cross(omega, once))
 
@@ -101,8 +101,7 @@ def inverse_right_jacobian(twist: Float[Any, "*b 6"]) -> Float[Any, "*b 6 6"]:
     )
     algebra = _lower_blocks(skew(twist[..., :3]), skew(twist[..., 3:]))
     square = product(algebra, algebra)
-    eye = xp.eye(6, dtype=twist.dtype)
-    return eye + algebra / 2 + second * square + fourth * product(square, square)
+    return _eye(algebra) + algebra / 2 + second * square + fourth * product(square, square)
 
 
 def skew(vector: Float[Any, "*b 3"]) -> Float[Any, "*b 3 3"]:
@@ -148,6 +147,12 @@ def inverted(transform: RigidTransform) -> RigidTransform:
 def module_of(array: Any) -> ModuleType:
     """The module whose functions take this array: numpy or jax.numpy."""
     return np if isinstance(array, np.ndarray | np.generic) else jnp
+
+
+def _eye(like: Any) -> Any:
+    """The unit matrix, with as many axes as `like`: JAX may be told not to add axes."""
+    eye = module_of(like).eye(like.shape[-1], dtype=like.dtype)
+    return eye.reshape((1,) * (like.ndim - 2) + eye.shape)
 
 
 def _lower_blocks(diagonal: Any, lower: Any) -> Any:

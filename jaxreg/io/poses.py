@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 FORMATS = (".json", ".txt", ".tum", ".kitti", ".g2o")
+_SWAP = [3, 4, 5, 0, 1, 2]
 _REMEDY = "export the poses again"
 
 
@@ -243,10 +244,9 @@ def _symmetric(values: Sequence[float]) -> np.ndarray:
 
 
 def _rotation_first(information: np.ndarray) -> np.ndarray:
-    """g2o's order is translation and the vector part of a quaternion, which is half the angle."""
-    swap = [3, 4, 5, 0, 1, 2]
-    scale = np.repeat([0.5, 1.0], 3)
-    return information[np.ix_(swap, swap)] * np.outer(scale, scale)
+    """From translation before rotation. The latter counts as a rotation vector, as GTSAM and Ceres have
+    it; g2o itself takes the vector part of a quaternion, which is half of it."""
+    return information[np.ix_(_SWAP, _SWAP)]
 
 
 def _row(values: Sequence[float]) -> str:
@@ -278,8 +278,7 @@ def _g2o_text(poses: np.ndarray, edges: Edges | None) -> str:
         if np.isfinite(pose).all()
     ]
     for source, reference, transform, information in zip(*(edges or ([],) * 4), strict=True):
-        swap, scale = [3, 4, 5, 0, 1, 2], np.repeat([1.0, 2.0], 3)
-        values = (information[np.ix_(swap, swap)] * np.outer(scale, scale))[np.triu_indices(6)]
+        values = information[np.ix_(_SWAP, _SWAP)][np.triu_indices(6)]
         numbers = [*_quaternion(transform), *values.tolist()]
         lines.append(f"EDGE_SE3:QUAT {reference} {source} {_row(numbers)}")
     return "".join(lines)

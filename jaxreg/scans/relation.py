@@ -22,6 +22,8 @@ How = Literal["search", "wide search", "start"]
 _KEPT_IN_MEMORY = 64
 """Prepared scans that a worker keeps."""
 _FORMAT = 1
+_HOPELESS = 0.05
+"""A pose of a smaller probability is not refined: it would take as long as the search."""
 
 
 class Task(NamedTuple):
@@ -69,6 +71,7 @@ def register_task(
         reference,
         config,
         start=None if start is None else RigidTransform(start[:3, :3], start[:3, 3]),
+        least=_HOPELESS,
     )
     return Relation(
         task.source, task.reference, task.how, found.transformation, found.probability,

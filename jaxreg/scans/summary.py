@@ -74,7 +74,8 @@ def alignment_verdict(alignment: Alignment) -> str:
     least = min(float(alignment.probability[k]) for k in groups[0])
     placed = len(groups[0])
     which = f"all {count} scans placed" if placed == count else f"{placed} of {count} scans placed"
-    return f"{which} (each right with a probability of {least:.2f} or more)"
+    chance = "above 0.99" if least > 0.99 else f"{math.floor(100 * least) / 100:.2f} or more"
+    return f"{which} (the probability of each is {chance})"
 
 
 def alignment_figures(alignment: Alignment) -> dict[str, str]:
