@@ -1,4 +1,4 @@
-"""The command `jaxreg`: six programs; only the one that is called is loaded.
+"""The command `jaxreg`: seven programs; only the one that is called is loaded.
 
 Exit status: 0 success; 2 bad input; 3 finished, but do not trust the result; 130 interrupted.
 """
@@ -13,6 +13,7 @@ import tyro
 
 from jaxreg import __version__
 from jaxreg.cli import process
+from jaxreg.cli.align import Align
 from jaxreg.cli.export import Export
 from jaxreg.cli.info import Info
 from jaxreg.cli.options import SUCCESS, say, status_of
@@ -49,6 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     command: Any = tyro.extras.subcommand_cli_from_dict(
         {
             "register": Register,
+            "align": Align,
             "info": Info,
             "view": View,
             "train": _Train,

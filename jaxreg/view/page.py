@@ -35,12 +35,12 @@ def write_registration_page(
     out. Large clouds are thinned evenly for display.
     """
     rows = shown_rows(source)
-    origin = _middle(reference)
+    origin = middle(reference)
     shift = brought_near(source[rows], reference[shown_rows(reference)])
     clouds = [
-        _cloud(names[0], source[rows] + shift, origin, len(source), moves=True)
+        packed_cloud(names[0], source[rows] + shift, origin, len(source), moves=True)
         | {"confidence": _packed(np.round(255 * result.confidence[rows]).astype(np.uint8))},
-        _cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
+        packed_cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
     ]
     content = {
         "clouds": clouds,
@@ -48,21 +48,21 @@ def write_registration_page(
         "figures": [[name, value] for name, value in summary.figures(result).items()],
         "verdict": {"text": summary.verdict_line(result), "good": result.success},
     }
-    _write(path, f"{names[0]} on {names[1]}", content)
+    write_content(path, f"{names[0]} on {names[1]}", content)
 
 
 def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> None:
     """Write an HTML page with clouds as they are, all in one frame."""
-    origin = _middle(np.concatenate([_shown(points) for points in clouds.values()]))
+    origin = middle(np.concatenate([_shown(points) for points in clouds.values()]))
     shown = [
-        _cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
+        packed_cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
         for i, (name, points) in enumerate(clouds.items())
     ]
     sizes = [
         [name, " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))]
         for name, points in clouds.items()
     ]
-    _write(path, ", ".join(clouds), {"clouds": shown, "motions": [], "figures": sizes})
+    write_content(path, ", ".join(clouds), {"clouds": shown, "motions": [], "figures": sizes})
 
 
 def draw_registration(
@@ -100,7 +100,8 @@ def _headline(result: ScanRegistration, source: np.ndarray, *, shortened: bool) 
     return [summary.verdict_line(result), motion + note]
 
 
-def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
+def write_content(path: str | Path, title: str, content: dict[str, Any]) -> None:
+    """Write the page of a content: `clouds`, `motion`, `figures`, and what else the viewer knows."""
     template = (resources.files("jaxreg.view") / "viewer.html").read_text("utf-8")
     # "</script" would end the element that holds the data, "<!--" could swallow its end.
     data = json.dumps(content).replace("<", "\\u003c")
@@ -108,7 +109,7 @@ def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
     Path(path).write_text(page, encoding="utf-8")
 
 
-def _cloud(
+def packed_cloud(
     name: str,
     points: np.ndarray,
     origin: np.ndarray,
@@ -169,8 +170,8 @@ def _motion(
     return {"axis": axis.tolist(), "angle": angle, "shortened": bool(shift.any())} | ways
 
 
-def _middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
+def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """The middle of the box of finite points. Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
     finite = points[np.isfinite(points).all(axis=1)]
     return (finite.min(axis=0) + finite.max(axis=0)) / 2
 
@@ -179,12 +180,12 @@ def _shown(points: np.ndarray) -> np.ndarray:
     return points[shown_rows(points)]
 
 
-def shown_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "k"]:
+def shown_rows(points: Float[np.ndarray, "n 3"], *, most: int = _SHOWN) -> Int[np.ndarray, "k"]:
     """The finite rows, or an even share of them if a picture needs no more."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(rows) <= _SHOWN:
+    if len(rows) <= most:
         return rows
-    return np.sort(np.random.default_rng(0).choice(rows, _SHOWN, replace=False))
+    return np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
 
 
 def _packed(array: np.ndarray) -> str:
