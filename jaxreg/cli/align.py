@@ -32,8 +32,8 @@ class Align:
     scans: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN...")]
     """The clouds, two or more: any formats that `jaxreg register` reads."""
     output: Output = None
-    """Write the merged cloud here (PLY: with a property `scan`, and the colours that came with the scans;
-    other formats: points). Of several groups each has its own file, numbered."""
+    """Write the merged cloud here (PLY: with a property `scan`, and the colours that came with the
+    scans; other formats: points). Of several groups each has its own file, numbered."""
     poses: OptionalPath = None
     """Write the poses, scan to common frame, to this file: .json, .txt (4x4), .tum, .kitti or .g2o."""
     json: OptionalPath = None
@@ -155,9 +155,7 @@ def _write(command: Align, scans: list["Scan"], alignment: "Alignment") -> list[
     return written
 
 
-def _write_merged(
-    command: Align, clouds: list[np.ndarray], alignment: "Alignment"
-) -> list[Path]:
+def _write_merged(command: Align, clouds: list[np.ndarray], alignment: "Alignment") -> list[Path]:
     from jaxreg import io
 
     assert command.output is not None
@@ -169,7 +167,9 @@ def _write_merged(
         colors = None
         if command.voxel is None:
             members = alignment.groups[k]
-            colors = io.read_colors([command.scans[i] for i in members], [clouds[i] for i in members])
+            colors = io.read_colors(
+                [command.scans[i] for i in members], [clouds[i] for i in members]
+            )
         with io.whole(path) as part:
             io.write_merged(part, points, scan, colors)
         paths.append(path)
@@ -195,4 +195,6 @@ def _print(command: Align, scans: list["Scan"], alignment: "Alignment", seconds:
         line("not placed", f"and {len(alignment.unplaced) - _LISTED} more: see --json")
     line("verdict", summary.alignment_verdict(alignment))
     if not alignment.success:
-        say(f"{'hint':<16} look at it with --html PAGE.html; poses to start from help: --initial FILE")
+        say(
+            f"{'hint':<16} look at it with --html PAGE.html; poses to start from help: --initial FILE"
+        )

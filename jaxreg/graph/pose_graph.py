@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Int
 from jaxreg.graph import se3
 from jaxreg.types import RigidTransform
 
-
 CHI_SQUARED = 16.8
 """Of the errors of right edges, chi squared with 6 degrees of freedom, 1 % are larger."""
 
@@ -33,8 +32,11 @@ class PoseGraph(NamedTuple):
 
 
 class EdgeEquations(NamedTuple):
-    """What each edge adds to ``H delta = -g``: of its (source, reference) the gradient and the block on
-    the diagonal, and the block of H in the reference's row and the source's column."""
+    """What each edge adds to ``H delta = -g``.
+
+    Of its (source, reference) the gradient and the block on the diagonal, and the block of H in the
+    reference's row and the source's column.
+    """
 
     gradient: tuple[Float[Any, "e 6"], Float[Any, "e 6"]]
     diagonal: tuple[Float[Any, "e 6 6"], Float[Any, "e 6 6"]]
@@ -83,9 +85,7 @@ def retract(poses: RigidTransform, step: Float[Any, "n 6"]) -> RigidTransform:
     return RigidTransform(se3.product(moved.rotation, 1.5 * eye - 0.5 * gram), moved.translation)
 
 
-def truncated_weights(
-    squared: Float[Any, "e"], threshold: Any, control: Any
-) -> Float[Any, "e"]:
+def truncated_weights(squared: Float[Any, "e"], threshold: Any, control: Any) -> Float[Any, "e"]:
     """Weights of truncated least squares made convex by `control` (Yang et al., 2020, eq. 14).
 
     1 below ``mu / (mu + 1) c^2``, 0 above ``(mu + 1) / mu c^2``; `threshold` is ``c^2``. As `control`
@@ -107,9 +107,7 @@ def _cleaned(graph: PoseGraph) -> PoseGraph:
         for part, eye in zip((graph.transform.rotation, graph.information), eyes, strict=True)
     )
     translation = xp.where(graph.mask[:, None], graph.transform.translation, 0)
-    return graph._replace(
-        transform=RigidTransform(rotation, translation), information=information
-    )
+    return graph._replace(transform=RigidTransform(rotation, translation), information=information)
 
 
 def _measured(graph: PoseGraph, poses: RigidTransform) -> RigidTransform:

@@ -102,7 +102,7 @@ class _Problem(NamedTuple):
 def _check(graph: PoseGraph, initial: RigidTransform) -> None:
     nodes, kept = len(initial.translation), np.asarray(graph.mask, bool)
     for name, index in (("source", graph.source), ("reference", graph.reference)):
-        if len(index) and not (0 <= index.min() and index.max() < nodes):
+        if len(index) and not (index.min() >= 0 and index.max() < nodes):
             raise ValueError(
                 f"graph.{name} has the index {index.max() if index.min() >= 0 else index.min()}, but "
                 f"there are {nodes} poses: number them from 0."
@@ -265,11 +265,13 @@ def pose_covariances(
     """The covariance of every pose, of a motion ``X_k exp(xi)`` of its own frame (rotation first).
 
     Marginals: diagonal blocks of the inverse of the Gauss-Newton matrix, at the minimum. Zero for poses
-    that are `fixed` (None: the first), NaN for those that no edge of positive weight ties to a fixed one.
+    that are `fixed` (None: the first), NaN where no edge of positive weight leads to a fixed one.
     """
     count = len(poses.translation)
     held = np.arange(count) == 0 if fixed is None else np.asarray(fixed, bool)
-    kept = np.asarray(graph.mask, bool) & (np.ones(len(graph.mask), bool) if weights is None else weights > 0)
+    kept = np.asarray(graph.mask, bool) & (
+        np.ones(len(graph.mask), bool) if weights is None else weights > 0
+    )
     label = components(count, graph.source[kept], graph.reference[kept])
     tied = np.isin(label, label[held])
     problem = _Problem.of(graph._replace(mask=kept), poses, held | ~tied)

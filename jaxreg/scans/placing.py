@@ -23,8 +23,8 @@ SURE = 0.9
 _CONSIDERED = 0.02
 """Pairs of a smaller probability are not looked at: there are many, and nearly all are wrong."""
 _MODEL = 0.3
-"""What scans of one place differ by beyond their noise (moved things, bent depth, motion of the sensor),
-in reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
+"""What scans of one place differ by beyond their noise (moved things, bent depth, a moving sensor), in
+reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
 _BY_CHANCE = 1e-3
 """How often three pairs, one of them wrong, close a triangle."""
 _CLOSED = 0.98
@@ -108,7 +108,8 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
     """
     unit = float(np.median(sizes.radius))
     source, reference = (
-        np.array([getattr(r, name) for r in relations], np.int64) for name in ("source", "reference")
+        np.array([getattr(r, name) for r in relations], np.int64)
+        for name in ("source", "reference")
     )
     matrix = np.array([r.transformation for r in relations], np.float64).reshape(-1, 4, 4)
     turn = matrix[:, :3, :3]
@@ -190,7 +191,11 @@ def _confirmed(graph: PoseGraph, posterior, agrees, count: int) -> np.ndarray:
     sure = agrees & graph.mask & ~bridge
     label = components(count, graph.source[strong & ~bridge], graph.reference[strong & ~bridge])
     inside = sure & (label[graph.source] == label[graph.reference])
-    return np.where(inside, np.maximum(posterior, 0.99), np.where(agrees, posterior, np.minimum(posterior, 0.01)))
+    return np.where(
+        inside,
+        np.maximum(posterior, 0.99),
+        np.where(agrees, posterior, np.minimum(posterior, 0.01)),
+    )
 
 
 def _bridges(graph: PoseGraph, edges: Bool[np.ndarray, "e"], count: int) -> Bool[np.ndarray, "e"]:
@@ -261,11 +266,16 @@ def _in_units(poses: RigidTransform, sizes: Sizes, unit: float, group, first) ->
     """Poses of the scans as they were given, in the frame of the first of their group; NaN if alone."""
     shift = unit * poses.translation - se3.applied(poses.rotation, sizes.centre)
     given = RigidTransform(poses.rotation, shift)
-    ground = RigidTransform(*(part[first[np.maximum(group, 0)]] for part in given)) if len(first) else given
+    ground = (
+        RigidTransform(*(part[first[np.maximum(group, 0)]] for part in given))
+        if len(first)
+        else given
+    )
     rotation, translation = se3.between(ground, given)
     alone = group < 0
     return RigidTransform(
-        np.where(alone[:, None, None], np.nan, rotation), np.where(alone[:, None], np.nan, translation)
+        np.where(alone[:, None, None], np.nan, rotation),
+        np.where(alone[:, None], np.nan, translation),
     )
 
 
@@ -288,7 +298,9 @@ def _chances(graph: PoseGraph, used, posterior, group, first) -> Float[np.ndarra
     cost = 1e-9 - np.log(np.clip(posterior[used], 1e-9, 1))
     best = spanning_tree(count, graph.source[used], graph.reference[used], cost)
     edges = np.flatnonzero(used)[best]
-    ways = sparse.coo_matrix((cost[best], (graph.source[edges], graph.reference[edges])), shape=(count, count))
+    ways = sparse.coo_matrix(
+        (cost[best], (graph.source[edges], graph.reference[edges])), shape=(count, count)
+    )
     length = csgraph.dijkstra(ways.tocsr(), directed=False, indices=first, min_only=True)
     return np.where(group < 0, 0.0, np.exp(-length))
 
@@ -303,5 +315,6 @@ def _refusals(relations, used, agrees, posterior, group):
             yield "It contradicts pairs that agree among each other."
         else:
             yield (
-                f"Nothing confirms it, and alone it is not sure enough ({posterior[k]:.2f} of {SURE:g})."
+                "Nothing confirms it, and alone it is not sure enough: "
+                f"{posterior[k]:.2f} of {SURE:g}."
             )

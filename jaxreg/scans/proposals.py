@@ -62,7 +62,9 @@ def overlaps(
             if i >= j or np.linalg.norm(middles[i] - middles[j]) > extents[i] + extents[j]:
                 continue
             reach = 1.5 * max(prepared[k].coarse.spacing * prepared[k].radius for k in (i, j))
-            found[i, j] = min(_share(clouds[i], trees[j], reach), _share(clouds[j], trees[i], reach))
+            found[i, j] = min(
+                _share(clouds[i], trees[j], reach), _share(clouds[j], trees[i], reach)
+            )
     return found
 
 
