@@ -38,10 +38,14 @@ def test_kitti_s_own_file_is_read_by_lines(tmp_path):
 
 def test_tum_s_times_count_rows(tmp_path):
     """A half turn about z, as quaternion (x, y, z, w)."""
-    lines = "# time tx ty tz qx qy qz qw\n1305031102.17 1 2 3 0 0 1 0\n1305031102.21 4 5 6 0 0 0 1\n"
+    lines = (
+        "# time tx ty tz qx qy qz qw\n1305031102.17 1 2 3 0 0 1 0\n1305031102.21 4 5 6 0 0 0 1\n"
+    )
     (tmp_path / "t.tum").write_text(lines)
     found = read_poses(tmp_path / "t.tum", ["x", "y"])
-    np.testing.assert_allclose(found["x"][:3], [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3]], atol=1e-15)
+    np.testing.assert_allclose(
+        found["x"][:3], [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3]], atol=1e-15
+    )
 
 
 def test_g2o_keeps_edges_and_their_order(poses, seed, tmp_path):

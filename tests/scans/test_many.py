@@ -72,21 +72,25 @@ def test_a_second_run_goes_on_where_the_first_ended(scans, alignment, tmp_path, 
     made = []
 
     def counted(task, *rest):
-        made.append((task.reference, task.source))
-        if len(made) == 4:
+        if len(made) == 3 and not (tmp_path / "again").exists():
             raise KeyboardInterrupt
+        made.append(task[:3])
         return relation.register_task(task, *rest)
 
     monkeypatch.setattr(many, "register_task", counted)
     with pytest.raises(KeyboardInterrupt):
         register_many(scans[0], config=NARROW, work=tmp_path)
+    (tmp_path / "again").touch()
     kept = sorted((tmp_path / "pairs").iterdir())
     assert len(kept) == 3
     kept[0].write_text(kept[0].read_text()[:40])  # cut off, as by a full disk
-    made[:] = [None] * 4  # so that it is not interrupted again
-    again = register_many(scans[0], config=NARROW, work=tmp_path)
-    assert len(made) - 4 == len(alignment.pairs) - 2
-    assert_same(again, alignment)
+    first = set(made)
+    made.clear()
+    assert_same(register_many(scans[0], config=NARROW, work=tmp_path), alignment)
+    assert len(first & set(made)) == 1
+    made.clear()
+    assert_same(register_many(scans[0], config=NARROW, work=tmp_path), alignment)
+    assert made == []
 
 
 def assert_same(one, other):
@@ -119,11 +123,15 @@ def test_workers_give_the_same_bits_and_one_that_dies_costs_a_retry(scans, align
 def test_a_dask_cluster_gives_the_same_bits(scans, alignment, tmp_path):
     distributed = pytest.importorskip("distributed")
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
         distributed.Client(cluster) as client,
     ):
         executor = client.get_executor()
-        assert_same(register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), alignment)
+        assert_same(
+            register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), alignment
+        )
 
 
 def test_a_prepared_scan_is_the_same_after_it_was_stored(scans, tmp_path, seed):

@@ -83,7 +83,9 @@ def test_two_places_are_two_groups_and_a_foreign_scan_is_left_out(seed):
     rng = np.random.default_rng(seed)
     truth = poses(rng, 10)
     relations = ring(rng, truth, [1, 3, 5, 7, 9]) + ring(rng, truth, [0, 2, 4, 6])
-    relations += [relation(rng, truth, 8, k, probability=0.6, wrong=poses(rng, 1)[0]) for k in (0, 1)]
+    relations += [
+        relation(rng, truth, 8, k, probability=0.6, wrong=poses(rng, 1)[0]) for k in (0, 1)
+    ]
     found = place(relations, sizes(10))
     assert found.members() == ((1, 3, 5, 7, 9), (0, 2, 4, 6))
     assert found.group[8] == -1
