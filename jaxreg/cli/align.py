@@ -32,8 +32,8 @@ class Align:
     scans: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN...")]
     """The clouds, two or more: any formats that `jaxreg register` reads."""
     output: Output = None
-    """Write the merged cloud here (PLY: with a property `scan`, and the colours that came with the scans;
-    other formats: points). Of several groups each has its own file, numbered."""
+    """Write the merged cloud here (PLY: with a property `scan`, and the colours that came with the
+    scans; other formats: points). Of several groups each has its own file, numbered."""
     poses: OptionalPath = None
     """Write the poses, scan to common frame, to this file: .json, .txt (4x4), .tum, .kitti or .g2o."""
     json: OptionalPath = None

@@ -151,9 +151,7 @@ def _solved(blocks: _Blocks, graph: PoseGraph, damping, most: int) -> Float[Arra
 
 
 def _implicit_step(graph, poses, held, weights, most: int):
-    """Zero, with the derivative of the minimum by the graph, ``-H^-1 dg`` with the exact Hessian; and
-    the decrement.
-    """
+    """Zero, with the derivative of the minimum, ``-H^-1 dg`` with the exact Hessian; the decrement."""
     still = jax.lax.stop_gradient(graph)
     blocks = _blocks(still, poses, held, weights)
     inverses = jax.vmap(inverse_definite)(blocks.diagonal)

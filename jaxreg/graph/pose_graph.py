@@ -32,8 +32,10 @@ class PoseGraph(NamedTuple):
 
 
 class EdgeEquations(NamedTuple):
-    """What each edge adds to ``H delta = -g``: of its (source, reference) the gradient and the block on
-    the diagonal, and the block of H in the reference's row and the source's column.
+    """What each edge adds to ``H delta = -g``.
+
+    Of its (source, reference) the gradient and the block on the diagonal, and the block of H in the
+    reference's row and the source's column.
     """
 
     gradient: tuple[Float[Any, "e 6"], Float[Any, "e 6"]]

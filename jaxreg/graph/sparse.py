@@ -265,7 +265,7 @@ def pose_covariances(
     """The covariance of every pose, of a motion ``X_k exp(xi)`` of its own frame (rotation first).
 
     Marginals: diagonal blocks of the inverse of the Gauss-Newton matrix, at the minimum. Zero for poses
-    that are `fixed` (None: the first), NaN for those that no edge of positive weight ties to a fixed one.
+    that are `fixed` (None: the first), NaN where no edge of positive weight leads to a fixed one.
     """
     count = len(poses.translation)
     held = np.arange(count) == 0 if fixed is None else np.asarray(fixed, bool)

@@ -25,6 +25,8 @@ def spanning_tree(
     cost: Float[np.ndarray, "e"],
 ) -> Int[np.ndarray, "t"]:
     """The edges of a spanning forest with the smallest sum of costs (positive)."""
+    if len(source) == 0:
+        return np.empty(0, np.int64)
     low, high = np.minimum(source, reference), np.maximum(source, reference)
     # Of parallel edges the cheapest; csgraph would add them up.
     order = np.lexsort([cost, high, low])
@@ -92,7 +94,7 @@ def triangles(
 
 
 def triangle_errors(graph: PoseGraph, found: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "t"]:
-    """For every triangle of `triangles`, ``e^T (sum of covariances)^-1 e`` of the way around it.
+    """For every triangle ``e^T S^-1 e`` of the way around it, S the sum of the covariances.
 
     With nodes i < j < k and the measured ``A`` (j to i), ``B`` (k to j) and ``C`` (k to i), ``e`` is the
     logarithm of ``C^-1 A B``. Of right edges chi squared with 6 degrees.
@@ -111,7 +113,7 @@ def triangle_errors(graph: PoseGraph, found: Int[np.ndarray, "t 3"]) -> Float[np
 
 
 def _downwards(graph: PoseGraph, low: np.ndarray, covariance: np.ndarray, edges: np.ndarray):
-    """Transform and covariance of edges, from the node of the higher number to the lower."""
+    """Transform and covariance of edges, from the node of higher number to the lower."""
     given = RigidTransform(*(part[edges] for part in graph.transform))
     up = (graph.source[edges] == low[edges])[:, None]
     back, carried = se3.inverted(given), se3.adjoint(given)

@@ -1,4 +1,4 @@
-"""The merged cloud of many scans: of every point which scan it is from, and its colour if it had one."""
+"""The merged cloud of many scans: which scan every point is from, and its colour if it had one."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ _COLORS = ("red", "green", "blue")
 def read_colors(
     paths: Sequence[Path], clouds: Sequence[Float[np.ndarray, "n 3"]]
 ) -> np.ndarray | None:
-    """The colours (n, 3) uint8 of the finite points of PLY files, one after the other; None if none has.
+    """The colours (n, 3) uint8 of the finite points of PLY files in turn; None if none has any.
 
     Scans without colours are grey. A mesh, whose points are drawn from its faces, has none.
     """

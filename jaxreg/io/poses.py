@@ -44,9 +44,9 @@ def write_poses(
 ) -> None:
     """Write poses (scan to common frame) in the format of the suffix; NaN marks a scan without one.
 
-    `.json`: ``{"poses": {name: 4x4 or null}}``. `.txt`: four lines a scan below ``# name``. `.tum`: number,
-    translation and quaternion (x, y, z, w), scans without a pose left out. `.kitti`: the first three rows in
-    one line a scan, NaN where there is none. `.g2o`: vertices, and `edges`.
+    `.json`: ``{"poses": {name: 4x4 or null}}``. `.txt`: four lines a scan below ``# name``. `.tum`:
+    number, translation and quaternion (x, y, z, w), scans without a pose left out. `.kitti`: the first
+    three rows in one line a scan, NaN where there is none. `.g2o`: vertices, and `edges`.
 
     Raises:
       ValueError: the suffix is none of these.
@@ -58,7 +58,7 @@ def write_poses(
         ".json": lambda: _json_text(poses, names),
         ".txt": lambda: _matrix_text(poses, names),
         ".tum": lambda: _tum_text(poses),
-        ".kitti": lambda: "".join(_row(pose[:3].ravel()) for pose in poses),
+        ".kitti": lambda: "".join(_row(pose[:3].ravel().tolist()) for pose in poses),
         ".g2o": lambda: _g2o_text(poses, edges),
     }[path.suffix.lower()]
     path.write_text(write(), "utf-8")
@@ -67,8 +67,8 @@ def write_poses(
 def read_poses(path: str | Path, names: Sequence[str] = ()) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Poses by name: of JSON and 4x4 text the names there, of other files the numbers of the scans.
 
-    With `names` (paths or names of scans in their order) the result has one entry a scan that has a pose:
-    a name is found by itself, by its file name or by its stem, and numbers count the scans from 0.
+    With `names` (of the scans, in their order) the result has an entry for every scan that has a pose:
+    it is found by its name, its file name, its stem, or its number, from 0.
 
     Raises:
       ValueError: there is no such file, it is malformed, or none of the names has a pose in it.
@@ -242,8 +242,10 @@ def _symmetric(values: Sequence[float]) -> np.ndarray:
 
 
 def _rotation_first(information: np.ndarray) -> np.ndarray:
-    """From translation before rotation. The latter counts as a rotation vector, as GTSAM and Ceres have
-    it; g2o itself takes the vector part of a quaternion, which is half of it.
+    """From translation before rotation.
+
+    The latter counts as a rotation vector, as GTSAM and Ceres have it; g2o itself takes the vector part
+    of a quaternion, which is half of it.
     """
     return information[np.ix_(_SWAP, _SWAP)]
 
@@ -262,7 +264,7 @@ def _json_text(poses: np.ndarray, names: list[str]) -> str:
 
 def _matrix_text(poses: np.ndarray, names: list[str]) -> str:
     blocks = zip(names, poses, strict=True)
-    return "".join(f"# {name}\n" + "".join(map(_row, pose)) for name, pose in blocks)
+    return "".join(f"# {name}\n" + "".join(map(_row, pose.tolist())) for name, pose in blocks)
 
 
 def _tum_text(poses: np.ndarray) -> str:

@@ -21,14 +21,14 @@ from jaxreg.types import RigidTransform
 
 _EPSILON = 0.01
 """Variance across a surface, in units of that along it."""
-_WIDTHS = np.geomspace(8.0, 1.0, 8)
+_WIDTHS = np.geomspace(8.0, 1.0, 6)
 """How many times wider than the noise the kernel is, iteration by iteration."""
 _NARROW = 3.0
 """The last width of the kernel, in standard deviations of the residuals."""
 _PASSES = (1.0, 0.5)
 """The largest distance of corresponding points in each pass, in reaches of a pair."""
-_STRIDE = 2
-"""Every so many points pull; the ones between tell whether it helped."""
+_PULLING = 1000
+"""About so many points of a scan pull at each of its pairs; as many others tell whether it helped."""
 
 
 class JointRefinement(NamedTuple):
@@ -57,7 +57,7 @@ class _View(NamedTuple):
 def refine_jointly(
     placement: Placement, relations: list[Relation], prepared: list[Prepared]
 ) -> tuple[Placement, tuple[JointRefinement, ...]]:
-    """The placement with poses refined on all used pairs at once; a pass that does not help is undone."""
+    """The placement with poses refined on all used pairs; a pass that does not help is undone."""
     used = [r for r, is_used in zip(relations, placement.used, strict=True) if is_used]
     unit = float(np.median([cloud.radius for cloud in prepared]))
     views = [_view(relation, prepared, unit) for relation in used]
@@ -131,7 +131,8 @@ def _one_way(moving, still, moving_scale, still_scale, pose: RigidTransform, wit
 
     ``r = T x - y``, with ``T exp(delta_x)`` and ``exp(-delta_y) T``.
     """
-    x = moving.points[::_STRIDE] * moving_scale
+    stride = _stride(moving)
+    x = moving.points[::stride] * moving_scale
     moved = x @ pose.rotation.T + pose.translation
     distance, index = still.tree.query(
         moved / still_scale, distance_upper_bound=within / still_scale, workers=-1
@@ -139,7 +140,7 @@ def _one_way(moving, still, moving_scale, still_scale, pose: RigidTransform, wit
     near = np.isfinite(distance)
     x, moved, index = x[near], moved[near], index[near]
     residual = moved - still.points[index] * still_scale
-    turned = moving.host_normals[::_STRIDE][near] @ pose.rotation.T
+    turned = moving.host_normals[::stride][near] @ pose.rotation.T
     metric = _metric(turned, still.host_normals[index])
     force = se3.applied(metric, residual)
     squared = np.sum(residual * force, axis=1)
@@ -163,6 +164,11 @@ def _one_way(moving, still, moving_scale, still_scale, pose: RigidTransform, wit
         flat(by_moving).T @ force.ravel(),
         flat(by_still).T @ force.ravel(),
     )
+
+
+def _stride(cloud: IndexedCloud) -> int:
+    """Every so many points pull; two at least, so that some are left."""
+    return max(2, len(cloud.points) // _PULLING)
 
 
 def _metric(one: Float[np.ndarray, "p 3"], other: Float[np.ndarray, "p 3"]) -> np.ndarray:
@@ -195,7 +201,9 @@ def _distance(views: list[_View], poses: RigidTransform) -> float:
 
 
 def _off(moving, still, moving_scale, still_scale, pose, reach) -> np.ndarray:
-    moved = moving.points[1::_STRIDE] * moving_scale @ pose.rotation.T + pose.translation
+    stride = _stride(moving)
+    others = moving.points[stride // 2 :: stride] * moving_scale
+    moved = others @ pose.rotation.T + pose.translation
     distance, index = still.tree.query(
         moved / still_scale, distance_upper_bound=reach / still_scale, workers=-1
     )

@@ -21,12 +21,12 @@ from jaxreg.scans.prepare import Prepared, prepare, voxel_reduced
 from jaxreg.scans.relation import How, Relation, Task, WorkFolder, register_files, register_task
 from jaxreg.types import RigidTransform
 
-_ALL_PAIRS = 12
+_ALL_PAIRS = 8
 """Up to so many scans every pair is tried."""
-_NEAREST = 5
-"""Of more scans each is tried with so many that look most alike, and later with as many again."""
-_STIFF = 2
-"""Pairs that hold a scan in place; with fewer, more are looked for."""
+_NEAREST = 4
+"""Of more scans each is tried with so many that look most alike, and later with more."""
+_STIFF = 6
+"""Pairs that hold a placed scan; with fewer, it is also registered from where it lies."""
 _RETRIES = 2
 """How often a pair is tried again whose worker died."""
 _OVERLAP = 0.1
@@ -59,7 +59,8 @@ class Alignment:
     placed. `groups` are the scans that hang together, the largest group first; between groups nothing
     is known. `probability[k]` is the chance that the pose is right in its group (0 if not placed),
     `covariance[k]` that of a small rotation vector (rad) and translation about the scan's centre, in
-    the axes of the group, relative to the group's first scan; `centres` are these centres. `pairs` are the registrations that were
+    the axes of the group, relative to the group's first scan; `centres` are these centres. `pairs` are
+    the registrations that were
     made, used ones and refused ones, `reasons[k]` says why a scan is not placed (empty if it is).
     `steps` tell what the joint refinement gained. `success` is True if all scans are in one group.
     """
@@ -83,9 +84,7 @@ class Alignment:
     @property
     def transformation(self) -> Float[np.ndarray, "n 4 4"]:
         """The same as 4x4 matrices."""
-        matrix = np.zeros((len(self.translation), 4, 4))
-        matrix[:, :3, :3], matrix[:, :3, 3], matrix[:, 3, 3] = self.rotation, self.translation, 1
-        return matrix
+        return _matrices(self.transform)
 
     @property
     def success(self) -> bool:
@@ -102,8 +101,8 @@ class Alignment:
     ) -> tuple[Float[np.ndarray, "p 3"], np.ndarray]:
         """The points of a group in its frame, and of each the number of its scan.
 
-        `clouds` are those that were registered. With `voxel` points of one scan in one cube of this edge
-        become their mean.
+        `clouds` are those that were registered. With `voxel`, points of one scan in one cube of this
+        edge become their mean.
 
         Raises:
           ValueError: there is no such group, or `voxel` is not positive.
@@ -254,7 +253,6 @@ class _Run(NamedTuple):
 
 def _find_pairs(run: _Run, order: str, starts: list[np.ndarray | None]) -> None:
     """Register pairs until every scan is held by several, or no promising pair is left."""
-    count = len(run.prepared)
     likeness = proposals.likeness(run.prepared)
     if any(start is not None for start in starts):
         run.do(_from_starts(run, starts), "registering pairs from their start")
@@ -263,10 +261,9 @@ def _find_pairs(run: _Run, order: str, starts: list[np.ndarray | None]) -> None:
         placement = placing.place(run.relations, run.sizes)
         run.do(_nearby(run, placement), "registering neighbours")
         placement = placing.place(run.relations, run.sizes)
-        wanted = _loose(run, placement)
-        if not wanted:
+        if (placement.group == 0).all():
             return
-        run.do(_wider(run, placement, likeness, wanted, count), "searching more widely")
+        run.do(_wider(run, placement, likeness), "searching more widely")
     run.do(_nearby(run, placing.place(run.relations, run.sizes)), "registering neighbours")
 
 
@@ -316,23 +313,34 @@ def _from_starts(run: _Run, starts: list[np.ndarray | None]) -> list[Task]:
 
 
 def _nearby(run: _Run, placement: Placement) -> list[Task]:
-    """Placed scans that should overlap, whose pair is not used: from where they lie."""
-    used = {
-        (r.reference, r.source)
-        for r, is_used in zip(run.relations, placement.used, strict=True)
-        if is_used or r.how == "start"
-    }
+    """Placed scans that should overlap, whose pair is not used: from where they lie.
+
+    Those that share most first, until each scan is held by several.
+    """
+    held = np.zeros(len(run.prepared), int)
+    done = set()
+    for relation, used in zip(run.relations, placement.used, strict=True):
+        held[[relation.source, relation.reference]] += used
+        if used or relation.how == "start":
+            done.add((relation.reference, relation.source))
+    matrices = _matrices(placement.poses)
     tasks = []
     for members in placement.members():
-        matrices = {}
-        for k in members:
-            matrices[k] = np.eye(4)
-            matrices[k][:3, :3] = placement.poses.rotation[k]
-            matrices[k][:3, 3] = placement.poses.translation[k]
-        for reference, source in _overlapping(run, matrices, used):
-            start = np.linalg.inv(matrices[reference]) @ matrices[source]
-            tasks.append(Task(source, reference, "start", start))
+        found = proposals.overlaps(run.prepared, {k: matrices[k] for k in members})
+        for pair in sorted(found, key=lambda pair: (-found[pair], pair)):
+            if found[pair] < _OVERLAP or pair in done or held[list(pair)].min() >= _STIFF:
+                continue
+            held[list(pair)] += 1
+            start = np.linalg.inv(matrices[pair[0]]) @ matrices[pair[1]]
+            tasks.append(Task(pair[1], pair[0], "start", start))
     return tasks
+
+
+def _matrices(poses: RigidTransform) -> np.ndarray:
+    """The poses as 4x4 matrices."""
+    matrix = np.zeros((len(poses.translation), 4, 4))
+    matrix[:, :3, :3], matrix[:, :3, 3], matrix[:, 3, 3] = *poses, 1
+    return matrix
 
 
 def _overlapping(
@@ -343,30 +351,17 @@ def _overlapping(
     return [pair for pair, share in found.items() if share >= _OVERLAP and pair not in but]
 
 
-def _loose(run: _Run, placement: Placement) -> list[int]:
-    """Scans that are alone, in a smaller group, or held by too few pairs while others were not tried."""
-    held = np.zeros(len(run.prepared), int)
-    for relation, used in zip(run.relations, placement.used, strict=True):
-        held[[relation.source, relation.reference]] += used
-    return np.flatnonzero(placement.group != 0).tolist()
-
-
-def _wider(
-    run: _Run, placement: Placement, likeness: np.ndarray, loose: list[int], count: int
-) -> list[Task]:
-    """For loose scans: the wider search with scans of other groups, the most alike first."""
-    tried = run.tried()
-    best = {(r.reference, r.source): r.probability for r in run.relations}
+def _wider(run: _Run, placement: Placement, likeness: np.ndarray) -> list[Task]:
+    """The wider search for scans outside the largest group, with the likeliest ones of other groups."""
+    tried, group = run.tried(), placement.group
+    chance = {(r.reference, r.source): r.probability for r in run.relations}
+    count = len(group)
     most = count if count <= _ALL_PAIRS else 2 * _NEAREST
     pairs: set[tuple[int, int]] = set()
-    for k in loose:
-        others = [
-            j
-            for j in range(count)
-            if j != k and (placement.group[j] != placement.group[k] or placement.group[k] < 0)
-        ]
-        fresh = [j for j in others if tried.get(_pair(j, k)) in (None, "search", "start")]
-        fresh.sort(key=lambda j: (-best.get(_pair(j, k), 0.0) - likeness[j, k], j))
+    for k in np.flatnonzero(group != 0).tolist():
+        others = np.flatnonzero((group != group[k]) | (group < 0)).tolist()
+        fresh = [j for j in others if j != k and tried.get(_pair(j, k)) != "wide search"]
+        fresh.sort(key=lambda j: (-chance.get(_pair(j, k), 0.0) - likeness[j, k], j))
         pairs |= {_pair(j, k) for j in fresh[:most]}
     return _tasks(pairs, "wide search")
 

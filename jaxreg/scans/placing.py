@@ -23,8 +23,8 @@ SURE = 0.9
 _CONSIDERED = 0.02
 """Pairs of a smaller probability are not looked at: there are many, and nearly all are wrong."""
 _MODEL = 0.3
-"""What scans of one place differ by beyond their noise (moved things, bent depth, motion of the sensor),
-in reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
+"""What scans of one place differ by beyond their noise (moved things, bent depth, a moving sensor), in
+reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
 _BY_CHANCE = 1e-3
 """How often three pairs, one of them wrong, close a triangle."""
 _CLOSED = 0.98
@@ -315,5 +315,6 @@ def _refusals(relations, used, agrees, posterior, group):
             yield "It contradicts pairs that agree among each other."
         else:
             yield (
-                f"Nothing confirms it, and alone it is not sure enough ({posterior[k]:.2f} of {SURE:g})."
+                "Nothing confirms it, and alone it is not sure enough: "
+                f"{posterior[k]:.2f} of {SURE:g}."
             )

@@ -150,7 +150,7 @@ def edges(alignment: Alignment) -> Edges:
 
 
 def _information(relation: Relation, centre: np.ndarray) -> np.ndarray:
-    """The inverse covariance of a motion of the source's frame, from one about the reference's centre."""
+    """The information of a motion of the source's frame, from one about the reference's centre."""
     if not np.isfinite(relation.covariance).all():
         return np.eye(6)
     away = np.eye(6)

@@ -171,7 +171,10 @@ def _motion(
 
 
 def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """The middle of the box of finite points. Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
+    """The middle of the box of finite points.
+
+    Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays.
+    """
     finite = points[np.isfinite(points).all(axis=1)]
     return (finite.min(axis=0) + finite.max(axis=0)) / 2
 
