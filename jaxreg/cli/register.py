@@ -19,7 +19,7 @@ from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
     from jaxreg.io import Scan
-    from jaxreg.scans.pair import ScanRegistration
+    from jaxreg.scans.result import ScanRegistration
 
 _CACHE_MISS = "/jax/compilation_cache/cache_misses"
 _COMPILING = (

@@ -9,15 +9,14 @@ source at another size?
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
+from jaxreg.scans import planes
 from jaxreg.scans.prepare import Prepared
 from jaxreg.types import RigidTransform
 
 _SAMPLE = 4000
 """Points of the source that are compared."""
-_NEIGHBORS = 12
-"""Points of a patch of surface."""
 _OFF = 8.0
 """A point this many noise levels from the other surface is off it."""
 _STEP = 0.1
@@ -30,6 +29,8 @@ _BETTER = 0.4
 _SIZES = 0.005
 """The smallest change of size, as a share, that is told."""
 _ITERATIONS = 30
+_WIDEST = 3.0
+"""Where the kernel ends, in the distances that it is to judge."""
 
 
 class Agreement(NamedTuple):
@@ -52,15 +53,6 @@ class Agreement(NamedTuple):
         return self.compared >= 0.9 * other.compared and self.off <= _BETTER * other.off
 
 
-class _Patches(NamedTuple):
-    """Of the surface next to some points: a point on it, its normal, noise and width."""
-
-    centre: Float[np.ndarray, "p 3"]
-    normal: Float[np.ndarray, "p 3"]
-    noise: Float[np.ndarray, "p"]
-    width: Float[np.ndarray, "p"]
-
-
 def agreement(
     source: Prepared, reference: Prepared, pose: RigidTransform, scale: float = 1.0
 ) -> Agreement:
@@ -71,7 +63,7 @@ def agreement(
     some, noise = _sampled(source)
     moved = scale * some @ pose.rotation.T + pose.translation
     patches = _patches(reference, moved)
-    off, beside = _offsets(moved, patches)
+    off, beside = planes.offsets(moved, patches)
     noise = np.hypot(scale * noise, patches.noise)
     noise = np.maximum(noise, _STEP * np.median(patches.width))
     over = _over(off, beside, patches, noise)
@@ -85,26 +77,21 @@ def at_another_size(
 ) -> tuple[float, Agreement]:
     """The scale at which the source fits best, from `pose` on, and how well it fits there.
 
-    Gauss-Newton on distances from planes, with a kernel that narrows from `reach`; seven unknowns.
+    Gauss-Newton on distances from planes, with a kernel that narrows to the noise; seven unknowns.
     """
     some, noise = _sampled(source)
-    rotation, shift, scale = pose.rotation, pose.translation, 1.0
-    narrowest = 3 * np.median(noise) + _STEP * reach
-    for width in np.geomspace(reach, min(narrowest, reach), _ITERATIONS):
-        turned = scale * some @ rotation.T
-        patches = _patches(reference, turned + shift)
-        off, beside = _offsets(turned + shift, patches)
-        near = (beside < 3 * patches.width) & (np.abs(off) < 3 * width)
-        if near.sum() < 20:
-            break
-        normal, weight = patches.normal[near], width**2 / (width**2 + off[near] ** 2)
-        rows = np.column_stack(
-            [np.cross(turned[near], normal), normal, np.sum(turned[near] * normal, axis=1)]
-        )
-        step = np.linalg.lstsq(weight[:, None] * rows, -weight * off[near], rcond=1e-9)[0]
-        rotation, shift = _turn(step[:3]) @ rotation, shift + step[3:6]
-        scale *= float(np.exp(np.clip(step[6], -0.1, 0.1)))
-    return scale, agreement(source, reference, RigidTransform(rotation, shift), scale)
+    unit = reference.radius
+    narrowest = min(3 * float(np.median(noise)) + _STEP * reach, reach)
+    found = planes.fitted(
+        some / unit,
+        (reference.points, reference.tree),
+        RigidTransform(pose.rotation, pose.translation / unit),
+        _WIDEST / unit * np.geomspace(reach, narrowest, _ITERATIONS),
+        motions=np.eye(6),
+        scale=1.0,
+    )
+    pose = RigidTransform(found.pose.rotation, unit * found.pose.translation)
+    return found.scale, agreement(source, reference, pose, found.scale)
 
 
 def size_text(scale: float, now: Agreement, then: Agreement) -> str:
@@ -118,42 +105,20 @@ def _sampled(cloud: Prepared) -> tuple[np.ndarray, np.ndarray]:
     """Points of the cloud about its centre in the unit of the input, and the noise there."""
     rows = np.linspace(0, len(cloud.points) - 1, min(_SAMPLE, len(cloud.points))).astype(int)
     points = cloud.points[rows]
-    noise = _patches_of(cloud, points).noise
+    noise = planes.patches(cloud.points, cloud.tree, points).noise
     return points * cloud.radius, noise * cloud.radius
 
 
-def _patches(cloud: Prepared, at: np.ndarray) -> _Patches:
+def _patches(cloud: Prepared, at: np.ndarray) -> planes.Patches:
     """The patches of a cloud next to some points, all in the unit of the input."""
-    centre, normal, noise, width = _patches_of(cloud, at / cloud.radius)
-    return _Patches(centre * cloud.radius, normal, noise * cloud.radius, width * cloud.radius)
-
-
-def _patches_of(cloud: Prepared, at: np.ndarray) -> _Patches:
-    k = min(_NEIGHBORS, len(cloud.points))
-    found = cloud.points[cloud.tree.query(at, k=list(range(1, k + 1)), workers=-1)[1]]
-    centre = found.mean(axis=1)
-    spread = found - centre[:, None]
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread) / k)
-    noise, width = np.sqrt(np.maximum(variance[:, 0], 0)), np.sqrt(np.maximum(variance[:, 1], 0))
-    return _Patches(centre, axes[:, :, 0], noise, width)
-
-
-def _offsets(points: np.ndarray, patches: _Patches) -> tuple[np.ndarray, np.ndarray]:
-    """How far points lie off their patches, and how far from the middle of it along them."""
-    residual = points - patches.centre
-    off = np.sum(residual * patches.normal, axis=1)
-    return off, np.linalg.norm(residual - off[:, None] * patches.normal, axis=1)
+    found = planes.patches(cloud.points, cloud.tree, at / cloud.radius)
+    centre, normal, noise, width = found
+    return planes.Patches(centre * cloud.radius, normal, noise * cloud.radius, width * cloud.radius)
 
 
 def _over(
-    off: np.ndarray, beside: np.ndarray, patches: _Patches, noise: np.ndarray
+    off: np.ndarray, beside: np.ndarray, patches: planes.Patches, noise: np.ndarray
 ) -> Bool[np.ndarray, "p"]:
     """Which points lie over their patch, and not so far off that it may be another surface."""
     typical = np.median(patches.width)
     return (beside < 3 * patches.width) & (np.abs(off) < np.maximum(100 * noise, 10 * typical))
-
-
-def _turn(vector: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation  # only scans that are suspicious need it
-
-    return Rotation.from_rotvec(vector).as_matrix()

@@ -1,8 +1,8 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
-import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -16,9 +16,11 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import probabilities
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, dense, diagnosis, prepare, verdict
+from jaxreg.scans import candidates, dense, diagnosis, few, prepare, stable, verdict
 from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
+from jaxreg.scans.result import LISTED, Accuracy, Alternative, ScanRegistration, Verdict, assembled
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.learned import load_features
 from jaxreg.search.stages import search_described
@@ -37,71 +39,6 @@ _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
 _MORE = 200
 """Further iterations of the refinement for a pose that still moves."""
-_LISTED = 0.01
-"""Smallest probability at which a pose is listed among the alternatives."""
-
-
-class Alternative(NamedTuple):
-    """Another pose of the source, and the probability that it is the right one."""
-
-    transform: RigidTransform
-    probability: float
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ScanRegistration:
-    """What `register` returns: the source's pose in the reference's frame, and how far to trust it.
-
-    float64, in the unit of the input, one row per row of the source. `transformation` is the 4x4
-    form of (`rotation`, `translation`). `correspondences[i]` is the reference point nearest to
-    source point `i` after alignment (NaN for a dropped point), and `confidence[i]`, in [0, 1], how
-    near: ``(1 - (d / max_correspondence_distance)^2)^2``. That distance, within which two points
-    count as the same surface, follows from their spacing. `fitness` is the share of the source's
-    points within it, `inlier_rmse` the root mean square distance of those, `overlap` the share of
-    both clouds within it of the other, at equal density.
-
-    `success` is False if the pose should not be trusted, and `reason` says why in one sentence;
-    `probability` is the calibrated chance that the pose is right, and `evidence` is what it is
-    computed from. `alternatives` are the other poses that may be right, the likeliest first; their
-    probabilities and `probability` add up to at most 1.
-
-    `covariance` is that of a small rotation vector (rad) and translation about the centroid of the
-    reference's distinct points; NaN if nothing was refined or no surfaces were near each other.
-    `weak_directions` are the motions that barely change the fit. `converged` says whether the last
-    step of the refinement was below its tolerance (None: not refined); if not, it is no success.
-    `dropped` counts the rows of both clouds that were left out, because they are not finite or
-    strays; `notes` are sentences on what was odd about the clouds.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
-    transformation: Float[np.ndarray, "4 4"]
-    confidence: Float[np.ndarray, "n"]
-    correspondences: Float[np.ndarray, "n 3"]
-    success: bool
-    probability: float
-    reason: str
-    overlap: float
-    fitness: float
-    inlier_rmse: float
-    max_correspondence_distance: float
-    covariance: Float[np.ndarray, "6 6"]
-    weak_directions: tuple[WeakDirection, ...]
-    alternatives: tuple[Alternative, ...]
-    evidence: Evidence
-    converged: bool | None
-    dropped: int
-    notes: tuple[str, ...]
-
-    @property
-    def transform(self) -> RigidTransform:
-        """Rotation and translation, from source to reference."""
-        return RigidTransform(self.rotation, self.translation)
-
-    @property
-    def reach(self) -> float:
-        """`max_correspondence_distance` by its short name."""
-        return self.max_correspondence_distance
 
 
 class Problem(NamedTuple):
@@ -147,6 +84,8 @@ def register(
     *,
     initial: object = None,
     max_rotation_deg: float | None = None,
+    known: Fact | Sequence[Fact] | None = None,
+    up: object = "z",
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
@@ -157,7 +96,14 @@ def register(
     order of the points and origin do not matter. `initial` (4x4 or a `RigidTransform`) starts from
     a known pose. The search is skipped, so `alternatives` is empty and the verdict does without
     rival poses. `max_rotation_deg` is the largest rotation to consider (None: any); it decides
-    between the poses of a symmetric shape. `nonfinite` and `strays` say what to do with rows that are
+    between the poses of a symmetric shape. `known` says what is known of the pair: "upright", both
+    scans have the axis `up` ("x", "y", "z" or a vector) upwards, so that the source is turned about
+    it alone; "inside", the source lies wholly in the reference, which shows far more; or both.
+
+    Clouds of at most 60 points each (targets, fiducials, stems) are matched point by point: the
+    poses on which most points agree are sought among all triples, and `evidence` is a `FewEvidence`.
+
+    `nonfinite` and `strays` say what to do with rows that are
     NaN or infinite, and with a few points that lie ten times as far from the middle as all others.
     The same input gives the same bits.
 
@@ -167,36 +113,45 @@ def register(
         prepared with another configuration.
     """
     config = RegisterConfig() if config is None else config
-    _check_options(max_rotation_deg, config)
-    start = None if initial is None else check_pose(initial, "initial")
-    problem = pose_problem(
-        _prepared(source, "source", nonfinite, strays, config),
-        _prepared(reference, "reference", nonfinite, strays, config),
-        config,
+    _check_options(config)
+    facts = known_of(known, up, max_rotation_deg)
+    start = None if initial is None else facts.allowed(check_pose(initial, "initial"))
+    first, second = (
+        _prepared(cloud, name, nonfinite, strays, config)
+        for cloud, name in ((source, "source"), (reference, "reference"))
     )
+    if few.is_few(first, second) and (found := few.registered(first, second, start, facts)):
+        return found
+    return _registered(first, second, start, facts, config)
+
+
+def _registered(
+    source: Prepared,
+    reference: Prepared,
+    start: RigidTransform | None,
+    known: Known,
+    config: RegisterConfig,
+) -> ScanRegistration:
+    """The registration of two scans of surfaces."""
+    problem = pose_problem(source, reference, config)
     if start is None:
-        found = _search(problem, max_rotation_deg)
+        found = _search(problem, known.max_rotation_deg)
     else:
         found = _Found(frame.transform_in(problem.where, start), ())
     refined = _refine(problem, found.pose)
-    return _result(problem, refined, found, _another_cause(problem, refined.transform))
+    return _result(problem, refined, found, _with_all_points(problem, refined, known))
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}
 """The smallest allowed value of these settings; the others must be positive."""
 
 
-def _check_options(max_rotation_deg: float | None, config: RegisterConfig) -> None:
+def _check_options(config: RegisterConfig) -> None:
     for name in ("search_points", "refine_points", "inlier_spacings", "refine_spacings"):
         value, least = getattr(config, name), _LEAST.get(name, 0)
         if not (least <= value < np.inf and value > 0):
             bound = f"at least {least}" if least else "positive"
             raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
-    if max_rotation_deg is not None and not 0 < max_rotation_deg <= 180:
-        raise ValueError(
-            f"max_rotation_deg must be above 0 and at most 180, got {max_rotation_deg}: leave it out "
-            "for clouds in any orientation."
-        )
 
 
 def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfig) -> Prepared:
@@ -225,9 +180,9 @@ def pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) 
     return Problem(source, reference, where, levels, unit, spacing, distance, config)
 
 
-def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
+def _search(problem: Problem, max_rotation_deg: float) -> _Found:
     """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
-    config, most = problem.config, math.radians(max_rotation_deg or 180.0)
+    config, most = problem.config, math.radians(max_rotation_deg)
     found = searched_and_judged(problem, most, config.search)
     if config.wide is not None and probabilities(found.score).max() < _SURE:
         found = candidates.merged(found, searched_and_judged(problem, most, config.wide))
@@ -315,20 +270,47 @@ def _refine(problem: Problem, pose: RigidTransform) -> Refined:
     )
 
 
-def _another_cause(problem: Problem, pose: RigidTransform) -> str:
-    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
-    source, reference, config = problem.source, problem.reference, problem.config
-    pose = _lengthened(pose, problem.where)
+class _Closing(NamedTuple):
+    """What all points say of a pose: a better one if there is one, why it is wrong, what to note."""
+
+    settled: stable.Settled | None = None
+    cause: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        if self.settled is None:
+            return ()
+        moved = 1 - self.settled.stayed
+        return (f"{moved:.0%} of the points moved or changed: the pose rests on the others",)
+
+
+def _with_all_points(problem: Problem, refined: Refined, known: Known) -> _Closing:
+    """The last stage where parts have moved; where that is not why points disagree, the cause."""
+    source, reference = problem.source, problem.reference
+    pose = _lengthened(refined.transform, problem.where)
     now = dense.agreement(source, reference, pose)
     if not now.suspicious:
-        return ""
+        return _Closing()
+    settled = None
+    if problem.config.refine is not None:
+        reach = problem.reach() * float(problem.where.length)
+        settled = stable.settled(source, reference, pose, reach, known=known)
+        settled = settled if settled.better else None
+    if settled is not None:
+        pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
+    return _Closing(settled, _another_cause(problem, pose, now) if now.suspicious else "")
+
+
+def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
+    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
+    source, reference, config = problem.source, problem.reference, problem.config
     reach = problem.distance * float(problem.where.length)
     scale, then = dense.at_another_size(source, reference, pose, reach)
     if told := dense.size_text(scale, now, then):
         return told
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
     twin = pose_problem(mirrored, reference, config)
-    other = _lengthened(_refine(twin, _search(twin, None).pose).transform, twin.where)
+    other = _lengthened(_refine(twin, _search(twin, 180.0).pose).transform, twin.where)
     if dense.agreement(mirrored, reference, other).explains(now):
         return "The mirrored source fits better."
     return ""
@@ -339,14 +321,15 @@ def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
     return RigidTransform(pose.rotation, pose.translation * float(where.length))
 
 
-def _result(problem: Problem, refined: Refined, found: _Found, cause: str) -> ScanRegistration:
+def _result(
+    problem: Problem, refined: Refined, found: _Found, closing: _Closing
+) -> ScanRegistration:
     source, where = problem.source, problem.where
-    length = float(where.length)
-    pose = frame.transform_out(where, refined.transform)
-    near, nearest = _nearest(problem, refined.transform)
-    inside = near <= problem.distance
-    confidence = np.maximum(0, 1 - (near / problem.distance) ** 2) ** 2
-    correspondences = problem.reference.points[nearest] * problem.reference.radius
+    length, cause = float(where.length), closing.cause
+    covariance = _covariance(refined.uncertainty, length)
+    if closing.settled is not None:
+        last, covariance = closing.settled.pose, closing.settled.covariance
+        refined = refined._replace(transform=last._replace(translation=last.translation / length))
     evidence, score = problem.clouds().judge(
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
     )
@@ -354,39 +337,24 @@ def _result(problem: Problem, refined: Refined, found: _Found, cause: str) -> Sc
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
     chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
     success = chance >= verdict.TRUSTED and refined.converged is not False
-    alternatives = tuple(
-        Alternative(frame.transform_out(where, other), float(likely))
-        for (other, _), likely in zip(found.others, chances[1:], strict=True)
-        if likely >= _LISTED
-    )
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(refined.uncertainty)
     )
-    return ScanRegistration(
-        rotation=pose.rotation,
-        translation=pose.translation,
-        transformation=np.block([[pose.rotation, pose.translation[:, None]], [0, 0, 0, 1]]),
-        confidence=source.per_input_row(confidence, missing=0.0),
-        correspondences=source.per_input_row(
-            correspondences + problem.reference.centre, missing=np.nan
-        ),
-        success=success,
-        probability=chance,
-        reason=""
-        if success
-        else cause or _reason(problem, refined, judged, weak, float(chances[1:].sum())),
+    reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
+    return assembled(
+        (source, problem.reference),
+        _lengthened(refined.transform, where),
+        Verdict(success, chance, "" if success else reason, judged),
+        Accuracy(covariance, weak, refined.converged),
+        distance=problem.distance * length,
         overlap=_overlap(problem, refined.transform),
-        fitness=float(np.mean(inside[source.row])),
-        inlier_rmse=float(np.sqrt(np.mean(near[inside] ** 2)) * length) if inside.any() else 0.0,
-        max_correspondence_distance=problem.distance * length,
-        covariance=_covariance(refined.uncertainty, length),
-        weak_directions=weak,
-        alternatives=alternatives,
-        evidence=judged,
-        converged=refined.converged,
-        dropped=int(np.sum(~source.kept) + np.sum(~problem.reference.kept)),
-        notes=(*source.notes, *problem.reference.notes),
+        alternatives=tuple(
+            Alternative(frame.transform_out(where, other), float(likely))
+            for (other, _), likely in zip(found.others, chances[1:], strict=True)
+            if likely >= LISTED
+        ),
+        notes=closing.notes,
     )
 
 
@@ -407,14 +375,6 @@ def _reason(
             *(f"{told[:1].upper()}{told[1:]}." for told in units),
         ]
     )
-
-
-def _nearest(problem: Problem, pose: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
-    """For every source point: distance, in the frame, to the nearest reference point, and its index."""
-    source, reference, length = problem.source, problem.reference, float(problem.where.length)
-    moved = source.points @ (pose.rotation.T * (source.radius / length)) + pose.translation
-    near, index = prepare.nearest(reference.tree, moved * (length / reference.radius))
-    return near * (reference.radius / length), index
 
 
 def _overlap(problem: Problem, pose: RigidTransform) -> float:

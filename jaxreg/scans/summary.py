@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.scans.pair import ScanRegistration
+from jaxreg.scans.result import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
 _MENTIONED = 0.05

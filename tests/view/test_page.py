@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
-from jaxreg.scans.pair import ScanRegistration
+from jaxreg.scans.result import ScanRegistration
 from jaxreg.view import page
 
 POSE = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
