@@ -15,7 +15,7 @@ from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
 from jaxreg.types import RigidTransform
 
-_APART_DEG, _APART = 6.0, 0.1
+APART_DEG, APART = 6.0, 0.1
 """Poses nearer to each other than this (in the unit of the frame) are one and the same."""
 _REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)
 """How a pose is refined before it is judged: surfaces a spacing apart say little."""
@@ -121,6 +121,6 @@ def _distinct(poses: RigidTransform, score: np.ndarray, most: int) -> list[int]:
             break
         turned = rotation_angle_deg(poses.rotation[chosen], poses.rotation[i][None])
         moved = np.linalg.norm(poses.translation[chosen] - poses.translation[i], axis=1)
-        if np.all((turned > _APART_DEG) | (moved > _APART)):
+        if np.all((turned > APART_DEG) | (moved > APART)):
             chosen.append(i)
     return chosen

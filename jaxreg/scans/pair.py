@@ -1,81 +1,17 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
-import functools
-import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
-import jax
 import numpy as np
-from jaxtyping import Float
 
-from jaxreg.geometry import frame
-from jaxreg.geometry.clouds import check_pose, padded_size
-from jaxreg.geometry.rigid import rotation_angle_deg
-from jaxreg.judge.evidence import Evidence
-from jaxreg.judge.odds import probabilities
-from jaxreg.refine.host import Refined, refine_indexed, unrefined
-from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, dense, diagnosis, few, prepare, stable, verdict
+from jaxreg.geometry.clouds import check_pose
+from jaxreg.scans import few, inside, prepare, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
-from jaxreg.scans.result import LISTED, Accuracy, Alternative, ScanRegistration, Verdict, assembled
-from jaxreg.search.config import SearchConfig
-from jaxreg.search.learned import load_features
-from jaxreg.search.stages import search_described
+from jaxreg.scans.result import ScanRegistration
 from jaxreg.types import RigidTransform
-
-_SMALLEST = 512
-"""Smallest size of a padded cloud in the search."""
-_TURN_COST = 0.2
-"""Log odds that half a turn costs in the choice of a pose: of poses that agree equally well (a
-symmetric shape) the one that turns least is taken."""
-_SURE = 0.9
-"""Probability at which the search ends, because an easy pair needs no wider one."""
-_UNLIKE_SIZES = 2.0
-"""Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
-_FIRST, _WIDE = 4, 16
-"""Distinct poses that are refined and judged, after the first search and after the wider one."""
-_MORE = 200
-"""Further iterations of the refinement for a pose that still moves."""
-
-
-class Problem(NamedTuple):
-    """Two prepared clouds in one frame; points within `distance` count as the same.
-
-    `levels` and `unit` are what the search compares, and its unit in that of the input.
-    """
-
-    source: Prepared
-    reference: Prepared
-    where: frame.Frame
-    levels: tuple[prepare.Level, prepare.Level]
-    unit: float
-    spacing: float
-    distance: float
-    config: RegisterConfig
-
-    def clouds(self) -> candidates.Clouds:
-        """Both fine levels in the frame."""
-        sides = (self.source, self.reference)
-        source, reference = (side.in_frame(side.fine, self.where) for side in sides)
-        return candidates.Clouds(
-            source, reference, (sides[0].fine.examined, sides[1].fine.examined)
-        )
-
-    def reach(self) -> float:
-        """The largest distance between corresponding points of the fine levels, in the frame."""
-        clouds, length = (self.source, self.reference), float(self.where.length)
-        spacings = (cloud.fine.spacing * cloud.radius / length for cloud in clouds)
-        return self.config.refine_spacings * min(self.spacing, max(prepare.FINEST, *spacings))
-
-
-class _Found(NamedTuple):
-    """The chosen pose in the frame, and the others with their log odds."""
-
-    pose: RigidTransform
-    others: tuple[tuple[RigidTransform, float], ...]
 
 
 def register(
@@ -120,26 +56,31 @@ def register(
         _prepared(cloud, name, nonfinite, strays, config)
         for cloud, name in ((source, "source"), (reference, "reference"))
     )
-    if few.is_few(first, second) and (found := few.registered(first, second, start, facts)):
-        return found
-    return _registered(first, second, start, facts, config)
+    return register_prepared(first, second, config, start=start, known=facts)
 
 
-def _registered(
+def register_prepared(
     source: Prepared,
     reference: Prepared,
-    start: RigidTransform | None,
-    known: Known,
     config: RegisterConfig,
+    *,
+    start: RigidTransform | None = None,
+    known: Known | None = None,
 ) -> ScanRegistration:
-    """The registration of two scans of surfaces."""
-    problem = pose_problem(source, reference, config)
-    if start is None:
-        found = _search(problem, known.max_rotation_deg)
-    else:
-        found = _Found(frame.transform_in(problem.where, start), ())
-    refined = _refine(problem, found.pose)
-    return _result(problem, refined, found, _with_all_points(problem, refined, known))
+    """`register` of clouds that were prepared with `config`, or with one that differs in `wide` only.
+
+    Every kind of pair has a module of its own; here is where one is chosen.
+    """
+    known = known or Known()
+    if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
+        return found
+    if known.inside:
+        return inside.registered(source, reference, config, start, (), known)
+    found = surfaces.registered(source, reference, config, start, known)
+    if found.success or not inside.is_possible(source, reference):
+        return found
+    tried = (found.transform, *(other.transform for other in found.alternatives))
+    return inside.registered(source, reference, config, start, tried, known)
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}
@@ -163,234 +104,3 @@ def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfi
             "jaxreg.prepare and jaxreg.register the same config."
         )
     return cloud
-
-
-def pose_problem(source: Prepared, reference: Prepared, config: RegisterConfig) -> Problem:
-    """Two prepared clouds in one frame."""
-    length = math.hypot(source.radius, reference.radius) / math.sqrt(2)
-    where = frame.Frame(source.centre, reference.centre, length)
-    levels = prepare.at_one_density(source, reference)
-    sides = zip(levels, (source, reference), strict=True)
-    spacing = max(
-        prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides)
-    )
-    distance = config.inlier_spacings * spacing
-    # Twice the radius: a usual shape then fills the unit sphere.
-    unit = prepare.in_steps(2 * length)
-    return Problem(source, reference, where, levels, unit, spacing, distance, config)
-
-
-def _search(problem: Problem, max_rotation_deg: float) -> _Found:
-    """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
-    config, most = problem.config, math.radians(max_rotation_deg)
-    found = searched_and_judged(problem, most, config.search)
-    if config.wide is not None and probabilities(found.score).max() < _SURE:
-        found = candidates.merged(found, searched_and_judged(problem, most, config.wide))
-        if (nearer := closer(problem)) and probabilities(found.score).max() < _SURE:
-            found = candidates.merged(found, searched_and_judged(nearer, most, config.wide))
-    turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
-    # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
-    # the others is at least an answer.
-    allowed = turned <= most + 1e-3
-    allowed = allowed if allowed.any() else np.ones_like(allowed)
-    best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
-    poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
-    others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
-    return _Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
-
-
-def closer(problem: Problem) -> Problem | None:
-    """The pair in the unit of the smaller cloud and at the density that shows it, if sizes differ."""
-    radii = sorted((problem.source.radius, problem.reference.radius))
-    if radii[1] < _UNLIKE_SIZES * radii[0]:
-        return None
-    levels = prepare.at_fine_density(problem.source, problem.reference)
-    return problem._replace(levels=levels, unit=prepare.in_steps(2 * radii[0]))
-
-
-def searched_and_judged(problem: Problem, most: float, search: SearchConfig) -> candidates.Judged:
-    """The distinct poses of one search, refined and judged; they turn by at most `most` radians."""
-    first = search == problem.config.search
-    poses, score = _searched_poses(problem, most, search, problem.config.learned or not first)
-    most_poses = _FIRST if first else _WIDE
-    return candidates.judged(
-        problem.clouds(), poses, score, distance=problem.reach(), most=most_poses
-    )
-
-
-def _searched_poses(
-    problem: Problem, most: float, search: SearchConfig, learned: bool
-) -> tuple[RigidTransform, np.ndarray]:
-    """The poses of the search in the pair's frame (float64), and their scores; the allowed ones."""
-    where, unit = problem.where, problem.unit
-    sizes = [padded_size(len(level.points), smallest=_SMALLEST) for level in problem.levels]
-    # One size for both, so that few programs are compiled, unless one cloud is far larger.
-    sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
-    sides = zip(problem.levels, sizes, (problem.source, problem.reference), strict=True)
-    described = (
-        level.described(unit / cloud.radius, size, search.radii) for level, size, cloud in sides
-    )
-    unmoved = frame.transform_in(
-        where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3))
-    )
-    # Clouds that lie farther apart than float32 reaches do not overlap as they are anyway.
-    also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
-    found = _program(search, learned)(*described, also, np.float32(most))
-    poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
-    scale = unit / float(where.length)
-    poses = poses._replace(translation=poses.translation * scale)
-    chosen = np.flatnonzero(found.allowed)
-    # If no pose is allowed, the best of the others is at least an answer.
-    chosen = chosen if len(chosen) else np.arange(len(found.allowed))
-    poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
-    return poses, np.asarray(found.score)[chosen]
-
-
-@functools.cache
-def _program(search: SearchConfig, learned: bool):
-    def run(network, source, reference, also, max_angle):
-        return search_described(
-            source, reference, network=network, also=also, max_angle=max_angle, config=search
-        )
-
-    network = jax.device_put(load_features()) if learned else None
-    return functools.partial(jax.jit(run), network)
-
-
-def _refine(problem: Problem, pose: RigidTransform) -> Refined:
-    """The pose refined with more points than the search had, or as it is."""
-    config = problem.config
-    if config.refine is None:
-        return unrefined(pose)
-    given = config.refine.max_correspondence_distance
-    distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
-    source, reference, _ = problem.clouds()
-    return refine_indexed(
-        source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE
-    )
-
-
-class _Closing(NamedTuple):
-    """What all points say of a pose: a better one if there is one, why it is wrong, what to note."""
-
-    settled: stable.Settled | None = None
-    cause: str = ""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        if self.settled is None:
-            return ()
-        moved = 1 - self.settled.stayed
-        return (f"{moved:.0%} of the points moved or changed: the pose rests on the others",)
-
-
-def _with_all_points(problem: Problem, refined: Refined, known: Known) -> _Closing:
-    """The last stage where parts have moved; where that is not why points disagree, the cause."""
-    source, reference = problem.source, problem.reference
-    pose = _lengthened(refined.transform, problem.where)
-    now = dense.agreement(source, reference, pose)
-    if not now.suspicious:
-        return _Closing()
-    settled = None
-    if problem.config.refine is not None:
-        reach = problem.reach() * float(problem.where.length)
-        settled = stable.settled(source, reference, pose, reach, known=known)
-        settled = settled if settled.better else None
-    if settled is not None:
-        pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
-    return _Closing(settled, _another_cause(problem, pose, now) if now.suspicious else "")
-
-
-def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
-    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
-    source, reference, config = problem.source, problem.reference, problem.config
-    reach = problem.distance * float(problem.where.length)
-    scale, then = dense.at_another_size(source, reference, pose, reach)
-    if told := dense.size_text(scale, now, then):
-        return told
-    mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
-    twin = pose_problem(mirrored, reference, config)
-    other = _lengthened(_refine(twin, _search(twin, 180.0).pose).transform, twin.where)
-    if dense.agreement(mirrored, reference, other).explains(now):
-        return "The mirrored source fits better."
-    return ""
-
-
-def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
-    """A pose in the frame as one of the centred clouds in the unit of the input."""
-    return RigidTransform(pose.rotation, pose.translation * float(where.length))
-
-
-def _result(
-    problem: Problem, refined: Refined, found: _Found, closing: _Closing
-) -> ScanRegistration:
-    source, where = problem.source, problem.where
-    length, cause = float(where.length), closing.cause
-    covariance = _covariance(refined.uncertainty, length)
-    if closing.settled is not None:
-        last, covariance = closing.settled.pose, closing.settled.covariance
-        refined = refined._replace(transform=last._replace(translation=last.translation / length))
-    evidence, score = problem.clouds().judge(
-        jax.tree.map(lambda leaf: leaf[None], refined.transform)
-    )
-    judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
-    chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
-    chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
-    success = chance >= verdict.TRUSTED and refined.converged is not False
-    weak = tuple(
-        direction._replace(point=where.reference_centre + length * direction.point)
-        for direction in weak_directions(refined.uncertainty)
-    )
-    reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
-    return assembled(
-        (source, problem.reference),
-        _lengthened(refined.transform, where),
-        Verdict(success, chance, "" if success else reason, judged),
-        Accuracy(covariance, weak, refined.converged),
-        distance=problem.distance * length,
-        overlap=_overlap(problem, refined.transform),
-        alternatives=tuple(
-            Alternative(frame.transform_out(where, other), float(likely))
-            for (other, _), likely in zip(found.others, chances[1:], strict=True)
-            if likely >= LISTED
-        ),
-        notes=closing.notes,
-    )
-
-
-def _reason(
-    problem: Problem,
-    refined: Refined,
-    judged: Evidence,
-    weak: tuple[WeakDirection, ...],
-    rivals: float,
-) -> str:
-    """Why the pose is not trusted, and whether the clouds seem to be in different units."""
-    source, reference = (c.points * c.radius for c in (problem.source, problem.reference))
-    units = diagnosis.compared(source, reference, least=3.0)
-    moving = f"The pose was still moving after {refined.iterations} iterations of the refinement."
-    return " ".join(
-        [
-            moving if refined.converged is False else verdict.reason(judged, weak, rivals),
-            *(f"{told[:1].upper()}{told[1:]}." for told in units),
-        ]
-    )
-
-
-def _overlap(problem: Problem, pose: RigidTransform) -> float:
-    """Share of the points of both clouds, at one density, within reach of the other."""
-    sides = zip(problem.levels, (problem.source, problem.reference), strict=True)
-    source, reference = (cloud.in_frame(level, problem.where) for level, cloud in sides)
-    within = problem.distance
-    there = reference.nearest(source.moved_by(pose), within=within)[0]
-    back = source.nearest(reference.moved_back_by(pose), within=within)[0]
-    distances = np.concatenate([there, back])
-    return float(np.mean(distances < problem.distance))
-
-
-def _covariance(uncertainty: PoseUncertainty, length: float) -> Float[np.ndarray, "6 6"]:
-    """About the centroid of the reference, which is the origin of the frame; NaN if unknown."""
-    if not uncertainty.weight > 0:
-        return np.full((6, 6), np.nan)
-    units = np.repeat([1.0, length], 3)
-    return about(uncertainty, np.zeros(3)).covariance * np.outer(units, units)

@@ -171,3 +171,31 @@ def centred(clouds: tuple[Prepared, Prepared], pose: RigidTransform) -> RigidTra
     source, reference = clouds
     shift = pose.translation + pose.rotation @ source.centre - reference.centre
     return RigidTransform(pose.rotation, shift)
+
+
+def widened(
+    found: ScanRegistration, clouds: tuple[Prepared, Prepared], origin: np.ndarray
+) -> ScanRegistration:
+    """A registration of parts of two clouds as one of the whole clouds.
+
+    `origin` is the centre of the part of the reference, about which the covariance was.
+    """
+    change = np.eye(6)
+    change[3:, :3] = np.cross(np.eye(3), clouds[1].centre - origin).T
+    return assembled(
+        clouds,
+        centred(clouds, found.transform),
+        Verdict(found.success, found.probability, found.reason, found.evidence),
+        Accuracy(
+            change @ found.covariance @ change.T,
+            found.weak_directions,
+            found.converged,
+            found.scale_sigma,
+        ),
+        distance=found.max_correspondence_distance,
+        overlap=found.overlap,
+        alternatives=found.alternatives,
+        notes=tuple(
+            note for note in found.notes if note not in (*clouds[0].notes, *clouds[1].notes)
+        ),
+    )
