@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
 from jaxreg.judge.evidence import REACH, Evidence, read_evidence
@@ -59,6 +59,32 @@ class Clouds(NamedTuple):
         evidence, score = _read(poses, *self.examined, scales, there, back)
         evidence = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
         return evidence, np.asarray(score, np.float64)[:count]
+
+
+def read(
+    poses: RigidTransform,
+    examined: tuple[Examined, Examined],
+    scales: tuple[float, float],
+    there: Int[np.ndarray, "k n"],
+    back: Int[np.ndarray, "k m"],
+) -> Evidence:
+    """The evidence for poses whose nearest points are known: see `jaxreg.judge.read_evidence`."""
+    count = len(poses.rotation)
+    poses = _padded(poses)
+    there, back = (
+        np.pad(
+            np.concatenate([index, index[-1:].repeat(len(poses.rotation) - count, 0)]),
+            [(0, 0), (0, len(cloud.mask) - index.shape[1])],
+        ).astype(np.int32)
+        for index, cloud in zip((there, back), examined, strict=True)
+    )
+    evidence, _ = _read(poses, *examined, scales, there, back)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
+
+
+def odds(evidence: Evidence) -> Float[np.ndarray, "k"]:
+    """The log odds of evidence in numpy."""
+    return np.asarray(log_odds(evidence), np.float64)
 
 
 def _padded(poses: RigidTransform) -> RigidTransform:

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
-from jaxreg.scans import few, inside, prepare, surfaces
+from jaxreg.scans import few, inside, planar, prepare, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
@@ -29,7 +29,8 @@ def register(
     """Register two scans: the transform ``y = R x + t`` from source to reference, with a verdict.
 
     The clouds are array-likes (n, 3) and (m, 3) in one unit, or results of `jaxreg.prepare`; size,
-    order of the points and origin do not matter. `initial` (4x4 or a `RigidTransform`) starts from
+    order of the points and origin do not matter. (n, 2) and (m, 2), or clouds of one z each, are
+    registered in the plane: a turn about z and two shifts, whose covariance has zeros elsewhere. `initial` (4x4 or a `RigidTransform`) starts from
     a known pose. The search is skipped, so `alternatives` is empty and the verdict does without
     rival poses. `max_rotation_deg` is the largest rotation to consider (None: any); it decides
     between the poses of a symmetric shape. `known` says what is known of the pair: "upright", both
@@ -56,6 +57,7 @@ def register(
         _prepared(cloud, name, nonfinite, strays, config)
         for cloud, name in ((source, "source"), (reference, "reference"))
     )
+    _check_dimensions((source, reference), (first, second))
     return register_prepared(first, second, config, start=start, known=facts)
 
 
@@ -72,8 +74,12 @@ def register_prepared(
     Every kind of pair has a module of its own; here is where one is chosen.
     """
     known = known or Known()
+    if flat := planar.is_planar(source, reference):
+        known = known._replace(up=planar.UP)
     if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
         return found
+    if flat:
+        return planar.registered(source, reference, config, start, known)
     if known.inside:
         return inside.registered(source, reference, config, start, (), known)
     found = surfaces.registered(source, reference, config, start, known)
@@ -81,6 +87,19 @@ def register_prepared(
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))
     return inside.registered(source, reference, config, start, tried, known)
+
+
+def _check_dimensions(given: tuple[object, object], clouds: tuple[Prepared, Prepared]) -> None:
+    """Two columns beside three are a mistake, unless the others have one z."""
+    shapes = [np.shape(cloud) if hasattr(cloud, "__len__") else () for cloud in given]  # pyright: ignore[reportArgumentType]
+    flat = [len(shape) == 2 and shape[1] == 2 for shape in shapes]
+    if flat[0] == flat[1] or planar.is_planar(*clouds):
+        return
+    name, other = ("source", "reference") if flat[0] else ("reference", "source")
+    raise ValueError(
+        f"{name} has shape {shapes[0 if flat[0] else 1]}, two coordinates a point, and {other} has "
+        "three: give both as (n, 2) or both as (n, 3)."
+    )
 
 
 _LEAST = {"search_points": 16, "refine_points": 16}

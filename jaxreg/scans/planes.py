@@ -40,13 +40,17 @@ class Fitted(NamedTuple):
     """A pose (and scale: ``y = scale R x + t``), its covariance, and the points it rests on.
 
     `covariance` is of (rotation vector, translation, log scale) about the origin of the reference;
-    rows of what was known are zero. `off` are the distances from the planes, `over` says where
+    rows of what was known are zero. `information` and `weight` are those of `PoseUncertainty`,
+    `last_step` is the larger of turn (radians) and shift of the last step. `off` are the distances from the planes, `over` says where
     there is one to compare with, and `noise` is the standard deviation of those near zero.
     """
 
     pose: RigidTransform
     scale: float
     covariance: Float[np.ndarray, "7 7"]
+    information: Float[np.ndarray, "6 6"]
+    weight: float
+    last_step: float
     off: Float[np.ndarray, "p"]
     over: Bool[np.ndarray, "p"]
     noise: float
@@ -108,6 +112,7 @@ def fitted(
     if scale is not None:
         basis[6, -1] = 1
     given = np.ones(len(source)) if weights is None else weights
+    last_step = np.inf
     for width in widths:
         rows, off, over = _linear(source, reference, rotation, shift, size, count, flat)
         weight = np.where(over, given * tukey(off / width), 0)
@@ -117,6 +122,7 @@ def fitted(
         normal = (system * weight[:, None]).T @ system
         step = basis @ np.linalg.lstsq(normal, -system.T @ (weight * off), rcond=1e-10)[0]
         rotation, shift = turn(step[:3]) @ rotation, turn(step[:3]) @ shift + step[3:6]
+        last_step = float(max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])))
         size *= float(np.exp(np.clip(step[6], -_LONGEST, _LONGEST)))
     rows, off, over = _linear(source, reference, rotation, shift, size, count, flat)
     last = float(widths[-1]) if len(widths) else np.inf
@@ -127,6 +133,9 @@ def fitted(
         RigidTransform(rotation, shift),
         size,
         basis @ covariance @ basis.T,
+        (rows[:, :6] * weight[:, None]).T @ rows[:, :6],
+        float(weight.sum()),
+        last_step,
         off,
         over,
         noise_of(off[weight > 0]),

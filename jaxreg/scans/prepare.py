@@ -138,7 +138,7 @@ def prepare(
 ) -> Prepared:
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
-    `cloud` is array-like (n, 3). `normals` (n, 3), of any length and sign, replace the computed
+    `cloud` is array-like (n, 3), or (n, 2) in the plane z = 0. `normals` (n, 3), of any length and sign, replace the computed
     ones; give zeros where unknown. `strays` are a few points ten times as far from the middle as
     all others (`Prepared.notes` tells of them): they are left out, take part, or are an error;
     centre and radius are those of the others in any case. `config` must be that of the
@@ -150,7 +150,7 @@ def prepare(
         and `strays` is "raise".
     """
     config = RegisterConfig() if config is None else config
-    array, kept = check_points(cloud, name, nonfinite=nonfinite)
+    array, kept = check_points(cloud, name, nonfinite=nonfinite, planar=True)
     across = None if normals is None else check_normals(normals, kept, name)
     far, notes = _strays(array[kept], strays, name)
     if strays == "drop":

@@ -275,7 +275,7 @@ def finished(problem: Problem, found: Found) -> ScanRegistration:
     judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
     chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
-    success = chance >= verdict.TRUSTED and refined.converged is not False
+    success = verdict.is_success(chance, chances[1:], refined.converged)
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(refined.uncertainty)
