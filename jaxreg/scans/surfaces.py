@@ -227,7 +227,7 @@ def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
     source, reference = problem.source, problem.reference
     pose = _lengthened(refined.transform, problem.where)
     now = dense.agreement(source, reference, pose)
-    if not now.suspicious:
+    if not (now.suspicious or now.drawn):
         return _Closing()
     settled = None
     if problem.config.refine is not None:
