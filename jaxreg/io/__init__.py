@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.io import arrays, e57, las, mesh, packed, pcd, ptx, text, unread
+from jaxreg.io.arrays import read_numbers
 from jaxreg.io.contents import Scan
 from jaxreg.io.matrix import read_matrix
 from jaxreg.io.places import check_folder, check_place, whole
@@ -22,6 +23,7 @@ __all__ = [
     "check_writable",
     "read_cloud",
     "read_matrix",
+    "read_numbers",
     "read_scan",
     "suffix",
     "whole",

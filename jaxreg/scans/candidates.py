@@ -113,6 +113,7 @@ def judged(
     *,
     distance: float,
     most: int,
+    motions: Float[np.ndarray, "6 f"] | None = None,
 ) -> Judged:
     """At most `most` distinct ones of the poses, the best by `score`, refined and judged.
 
@@ -122,7 +123,13 @@ def judged(
     chosen = _distinct(poses, score, most)
     poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
     moved = iterate_all(
-        _padded(poses), clouds.source, clouds.reference, weighting, config=_REFINE, step=_STEP
+        _padded(poses),
+        clouds.source,
+        clouds.reference,
+        weighting,
+        config=_REFINE,
+        step=_STEP,
+        motions=motions,
     )
     count = len(chosen)
     poses = RigidTransform(nearest_rotation(moved.rotation[:count]), moved.translation[:count])

@@ -47,7 +47,7 @@ class Outline(NamedTuple):
 def placed(
     source: Outline, reference: Outline, *, most: int, max_turn: float = math.pi
 ) -> Placements:
-    """The `most` distinct placements of the source on which outlines agree best; turns up to `max_turn`.
+    """The `most` distinct placements at which outlines agree best, turned by at most `max_turn`.
 
     Points should lie evenly along their curves, and around the origin.
     """

@@ -55,7 +55,7 @@ class Agreement(NamedTuple):
 
     @property
     def drawn(self) -> bool:
-        """Whether the pose may have been drawn along by a part that moved: nothing fits to the noise."""
+        """Whether nothing fits to the noise, as where a part that moved drew the pose along."""
         return self.compared >= _ENOUGH and self.spread >= _SPREAD
 
     def explains(self, other: "Agreement") -> bool:

@@ -124,6 +124,7 @@ def _judged(
             np.zeros(1),
             distance=problem.reach(),
             most=1,
+            motions=problem.motions,
         )
         refined = RigidTransform(found.poses.rotation[0], found.poses.translation[0])
         out = frame.transform_out(problem.where, refined)

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.refine.uncertainty import PoseUncertainty
 from jaxreg.types import RigidTransform
 
 Fact = Literal["upright", "inside"]
@@ -16,12 +17,13 @@ class Known(NamedTuple):
     """What a caller knows: the axis that both scans have upright, whether the source is a part, limits.
 
     `up` is a unit vector, or None if the source may be turned in any way. Rotations are by at most
-    `max_rotation_deg`.
+    `max_rotation_deg`. `weights` say how much the distinct points of the source count in the end.
     """
 
     up: Float[np.ndarray, "3"] | None = None
     inside: bool = False
     max_rotation_deg: float = 180.0
+    weights: Float[np.ndarray, "p"] | None = None
 
     @property
     def motions(self) -> Float[np.ndarray, "6 f"]:
@@ -30,6 +32,23 @@ class Known(NamedTuple):
         if self.up is None:
             return basis
         return np.column_stack([np.concatenate([self.up, np.zeros(3)]), basis[:, 3:]])
+
+    def conditional(self, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+        """The covariance of a pose whose other motions are known: ``B (B^T C^-1 B)^-1 B^T``."""
+        if self.up is None or not np.isfinite(covariance).all():
+            return covariance
+        basis = self.motions
+        inner = basis.T @ np.linalg.pinv(covariance, rcond=1e-14, hermitian=True) @ basis
+        return basis @ np.linalg.pinv(inner, rcond=1e-14, hermitian=True) @ basis.T
+
+    def held(self, found: PoseUncertainty) -> PoseUncertainty:
+        """The uncertainty with every point holding the rotations that are known."""
+        if self.up is None:
+            return found
+        known = np.zeros((6, 6))
+        known[:3, :3] = np.eye(3) - np.outer(self.up, self.up)
+        weight = float(found.weight) * float(found.length) ** 2
+        return found._replace(information=np.asarray(found.information) + weight * known)
 
     def allowed(self, pose: RigidTransform) -> RigidTransform:
         """The pose, turned about `up` alone: by the angle that is nearest to what it was."""

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
-from jaxreg.scans import few, inside, planar, prepare, surfaces
+from jaxreg.scans import few, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
-from jaxreg.scans.result import ScanRegistration
+from jaxreg.scans.result import ScanRegistration, widened
 from jaxreg.types import RigidTransform
 
 
@@ -22,6 +22,9 @@ def register(
     max_rotation_deg: float | None = None,
     known: Fact | Sequence[Fact] | None = None,
     up: object = "z",
+    scale: bool = False,
+    mask: object = None,
+    weights: object = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
@@ -30,19 +33,23 @@ def register(
 
     The clouds are array-likes (n, 3) and (m, 3) in one unit, or results of `jaxreg.prepare`; size,
     order of the points and origin do not matter. (n, 2) and (m, 2), or clouds of one z each, are
-    registered in the plane: a turn about z and two shifts, whose covariance has zeros elsewhere. `initial` (4x4 or a `RigidTransform`) starts from
-    a known pose. The search is skipped, so `alternatives` is empty and the verdict does without
-    rival poses. `max_rotation_deg` is the largest rotation to consider (None: any); it decides
-    between the poses of a symmetric shape. `known` says what is known of the pair: "upright", both
-    scans have the axis `up` ("x", "y", "z" or a vector) upwards, so that the source is turned about
-    it alone; "inside", the source lies wholly in the reference, which shows far more; or both.
+    registered in the plane: a turn about z and two shifts, whose covariance has zeros elsewhere.
+    Clouds of at most 60 points each (targets, fiducials, stems) are matched point by point: the poses
+    on which most points agree are sought among all triples, and `evidence` is a `FewEvidence`.
 
-    Clouds of at most 60 points each (targets, fiducials, stems) are matched point by point: the
-    poses on which most points agree are sought among all triples, and `evidence` is a `FewEvidence`.
+    `initial` (4x4 or a `RigidTransform`) starts from a known pose. The search is skipped, so
+    `alternatives` is empty and the verdict does without rival poses. `max_rotation_deg` is the
+    largest rotation to consider (None: any); it decides between the poses of a symmetric shape.
+    `known` says what is known of the pair: "upright", both scans have the axis `up` ("x", "y", "z"
+    or a vector) upwards, so that the source is turned about it alone; "inside", the source lies
+    wholly in the reference, which shows far more; or both. With `scale` the size of the source is
+    unknown, too: ``y = scale R x + t``, with `scale` and its standard deviation in the result.
 
-    `nonfinite` and `strays` say what to do with rows that are
-    NaN or infinite, and with a few points that lie ten times as far from the middle as all others.
-    The same input gives the same bits.
+    `mask` (n,) of booleans leaves out points of the source that are known to have moved; a pair of
+    masks is of both clouds. `weights` (n,) say how much the points of the source count in the last
+    stage. `nonfinite` and `strays` say what to do with rows that are NaN or infinite, and with a few
+    points that lie ten times as far from the middle as all others. The same input gives the same
+    bits.
 
     Raises:
       ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the
@@ -58,7 +65,29 @@ def register(
         for cloud, name in ((source, "source"), (reference, "reference"))
     )
     _check_dimensions((source, reference), (first, second))
-    return register_prepared(first, second, config, start=start, known=facts)
+    if mask is None and weights is None:
+        return register_prepared(first, second, config, start=start, known=facts, scale=scale)
+    parts, facts = _taking_part((first, second), mask, weights, facts, config)
+    found = register_prepared(*parts, config, start=start, known=facts, scale=scale)
+    return widened(found, (first, second), parts[1].centre)
+
+
+def _taking_part(
+    clouds: tuple[Prepared, Prepared], mask: object, weights: object, known: Known, config
+) -> tuple[tuple[Prepared, Prepared], Known]:
+    """The clouds without the points that take no part, and how much those of the source count."""
+    chosen = list(masks.masks_of(mask, (len(clouds[0].kept), len(clouds[1].kept))))
+    given = None if weights is None else masks.weights_of(weights, len(clouds[0].kept))
+    if given is not None:
+        chosen[0] = chosen[0] & (given > 0)
+    first, second = (
+        prepare.part(cloud, rows, config) for cloud, rows in zip(clouds, chosen, strict=True)
+    )
+    if given is None:
+        return (first, second), known
+    return (first, second), known._replace(
+        weights=masks.of_points(given[chosen[0] & clouds[0].kept], first)
+    )
 
 
 def register_prepared(
@@ -68,17 +97,30 @@ def register_prepared(
     *,
     start: RigidTransform | None = None,
     known: Known | None = None,
+    scale: bool = False,
 ) -> ScanRegistration:
-    """`register` of clouds that were prepared with `config`, or with one that differs in `wide` only.
-
-    Every kind of pair has a module of its own; here is where one is chosen.
-    """
+    """`register` of clouds that were prepared with `config`, or with another that differs in `wide`."""
     known = known or Known()
     if flat := planar.is_planar(source, reference):
         known = known._replace(up=planar.UP)
+    if not scale:
+        return _of_one_size(source, reference, config, start, known)
+    if few.is_few(source, reference):
+        raise ValueError("scale=True needs surfaces, clouds of more than 60 points: leave it out.")
+    return similar.registered(source, reference, config, start, known, run=_of_one_size, flat=flat)
+
+
+def _of_one_size(
+    source: Prepared,
+    reference: Prepared,
+    config: RegisterConfig,
+    start: RigidTransform | None,
+    known: Known,
+) -> ScanRegistration:
+    """Every kind of pair has a module of its own; here one is chosen."""
     if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
         return found
-    if flat:
+    if planar.is_planar(source, reference):
         return planar.registered(source, reference, config, start, known)
     if known.inside:
         return inside.registered(source, reference, config, start, (), known)

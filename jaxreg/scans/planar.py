@@ -43,10 +43,8 @@ _FEWEST = 20
 _JUDGED = 512
 """Points that the evidence is read at: a line of so many has about the spacing, beside its length, that
 a surface of some thousands has."""
-_PLACES = 24
-"""Placements that are refined."""
-_KEPT = 8
-"""Poses that are judged."""
+_PLACES = 16
+"""Placements that are refined and judged."""
 _TURN_COST = 0.2
 """As in `jaxreg.scans.surfaces`."""
 _NEIGHBORS = 8
@@ -103,8 +101,7 @@ def registered(
     else:
         inner = known.allowed(centred(clouds, start))
         fits = [_refined(x, y, ratio, _scaled(inner, 1 / reference.radius), _START, config)]
-    fits.sort(key=lambda fit: fit.noise / max(np.mean(fit.over), 1e-3))
-    poses = _stacked([fit.pose for fit in fits[:_KEPT]])
+    poses = _stacked([fit.pose for fit in fits])
     evidence, score = _judged(x, y, ratio, poses)
     ranked = candidates.ranked(poses, evidence, score)
     turned = np.abs(np.arctan2(ranked.poses.rotation[:, 1, 0], ranked.poses.rotation[:, 0, 0]))
@@ -270,7 +267,7 @@ def _held(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> float:
 
 
 def _accuracy(fit: planes.Fitted, reference: Prepared, config: RegisterConfig) -> Accuracy:
-    """Covariance of the three unknowns (all else is 0: known), and the motions that lines leave free."""
+    """Covariance of the three unknowns (all else is known: 0), and what the lines leave free."""
     if config.refine is None:
         return Accuracy(np.full((6, 6), np.nan), (), None)
     units = np.repeat([1.0, reference.radius], 3)

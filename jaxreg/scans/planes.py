@@ -41,8 +41,9 @@ class Fitted(NamedTuple):
 
     `covariance` is of (rotation vector, translation, log scale) about the origin of the reference;
     rows of what was known are zero. `information` and `weight` are those of `PoseUncertainty`,
-    `last_step` is the larger of turn (radians) and shift of the last step. `off` are the distances from the planes, `over` says where
-    there is one to compare with, and `noise` is the standard deviation of those near zero.
+    `last_step` is the larger of turn (radians) and shift of the last step. `off` are the distances
+    from the planes, `over` says where there is one to compare with, and `noise` is the standard
+    deviation of those near zero.
     """
 
     pose: RigidTransform

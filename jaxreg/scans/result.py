@@ -173,6 +173,11 @@ def centred(clouds: tuple[Prepared, Prepared], pose: RigidTransform) -> RigidTra
     return RigidTransform(pose.rotation, shift)
 
 
+def resized(cloud: Prepared, size: float) -> Prepared:
+    """The cloud times `size`. Nothing is computed again: its levels are in units of its radius."""
+    return dataclasses.replace(cloud, centre=size * cloud.centre, radius=size * cloud.radius)
+
+
 def widened(
     found: ScanRegistration, clouds: tuple[Prepared, Prepared], origin: np.ndarray
 ) -> ScanRegistration:
@@ -182,7 +187,8 @@ def widened(
     """
     change = np.eye(6)
     change[3:, :3] = np.cross(np.eye(3), clouds[1].centre - origin).T
-    return assembled(
+    clouds = resized(clouds[0], found.scale), clouds[1]
+    whole = assembled(
         clouds,
         centred(clouds, found.transform),
         Verdict(found.success, found.probability, found.reason, found.evidence),
@@ -199,3 +205,4 @@ def widened(
             note for note in found.notes if note not in (*clouds[0].notes, *clouds[1].notes)
         ),
     )
+    return dataclasses.replace(whole, transformation=found.transformation, scale=found.scale)

@@ -59,26 +59,24 @@ def settled(
     reach: float,
     *,
     known: Known,
-    weights: Float[np.ndarray, "p"] | None = None,
 ) -> Settled:
     """The pose on which the largest part agrees to the noise, from `pose` on.
 
     Both are of the centred clouds in the unit of the input, in which points may lie `reach` off.
-    `weights` are of the points of `source`.
     """
     unit, motions = reference.radius, known.motions
     whole = reference.points, reference.tree
     start = RigidTransform(pose.rotation, pose.translation / unit)
     few, many = _rows(source, _FIRST), _rows(source, _SECOND)
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
-    given = np.ones(len(source.points)) if weights is None else weights
+    given = np.ones(len(source.points)) if known.weights is None else known.weights
     noise = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, _CUT * noise), _CUT * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
     around = np.asarray(cKDTree(second).query(second, k=min(_AROUND, len(second)), workers=-1)[1])
     at = {"motions": motions, "count": _NEIGHBORS}
     narrow = np.geomspace(_CUT, _INNER, _STEADY)
-    stays, noise = given[many], noise
+    stays = given[many]
     for _ in range(_ROUNDS):
         found = planes.fitted(second, whole, found.pose, np.zeros(0), **at)
         noise = max(_core(found.off[found.over & (given[many] > 0)]), _LEAST)

@@ -1,5 +1,6 @@
 """Register two scans of surfaces: search, refine, judge, and look at all points."""
 
+import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -71,6 +72,11 @@ class Problem(NamedTuple):
         return candidates.Clouds(
             source, reference, (sides[0].fine.examined, sides[1].fine.examined)
         )
+
+    @property
+    def motions(self) -> Float[np.ndarray, "6 f"] | None:
+        """A basis of the unknown motions, None if nothing is known of them."""
+        return None if self.known.up is None else self.known.motions
 
     def reach(self) -> float:
         """The largest distance between corresponding points of the fine levels, in the frame."""
@@ -152,7 +158,12 @@ def searched_and_judged(problem: Problem, search: SearchConfig) -> candidates.Ju
     poses, score = searched_poses(problem, search, learned=learned)
     most_poses = _FIRST if first else _WIDE
     return candidates.judged(
-        problem.clouds(), poses, score, distance=problem.reach(), most=most_poses
+        problem.clouds(),
+        poses,
+        score,
+        distance=problem.reach(),
+        most=most_poses,
+        motions=problem.motions,
     )
 
 
@@ -173,7 +184,9 @@ def searched_poses(
     )
     # Clouds that lie farther apart than float32 reaches do not overlap as they are anyway.
     also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
-    found = _program(search, learned)(*described, also, np.float32(most))
+    up = None if problem.known.up is None else problem.known.up.astype(np.float32)
+    search = search if up is None else _eased(search)
+    found = _program(search, learned)(*described, also, np.float32(most), up)
     poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
     scale = unit / float(where.length)
     poses = poses._replace(translation=poses.translation * scale)
@@ -184,11 +197,21 @@ def searched_poses(
     return poses, np.asarray(found.score)[chosen]
 
 
+def _eased(search: SearchConfig) -> SearchConfig:
+    """Where both scans are level, half as many poses are enough."""
+    return dataclasses.replace(
+        search,
+        seeds=max(1, search.seeds // 2),
+        screened=max(1, search.screened // 2),
+        aligned=max(1, search.aligned // 2),
+    )
+
+
 @functools.cache
 def _program(search: SearchConfig, learned: bool):
-    def run(network, source, reference, also, max_angle):
+    def run(network, source, reference, also, max_angle, up):
         return search_described(
-            source, reference, network=network, also=also, max_angle=max_angle, config=search
+            source, reference, network=network, also=also, max_angle=max_angle, up=up, config=search
         )
 
     network = jax.device_put(load_features()) if learned else None
@@ -204,8 +227,9 @@ def refine_pose(problem: Problem, pose: RigidTransform) -> Refined:
     distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
     source, reference, _ = problem.clouds()
     return refine_indexed(
-        source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE
-    )
+        source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE,
+        motions=problem.motions,
+    )  # fmt: skip
 
 
 class _Closing(NamedTuple):
@@ -227,13 +251,14 @@ def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
     source, reference = problem.source, problem.reference
     pose = _lengthened(refined.transform, problem.where)
     now = dense.agreement(source, reference, pose)
-    if not (now.suspicious or now.drawn):
+    weights = problem.known.weights
+    if weights is None and not (now.suspicious or now.drawn):
         return _Closing()
     settled = None
     if problem.config.refine is not None:
         reach = problem.reach() * float(problem.where.length)
         settled = stable.settled(source, reference, pose, reach, known=problem.known)
-        settled = settled if settled.better else None
+        settled = settled if settled.better or weights is not None else None
     if settled is not None:
         pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
     return _Closing(settled, _another_cause(problem, pose, now) if now.suspicious else "")
@@ -265,7 +290,7 @@ def finished(problem: Problem, found: Found) -> ScanRegistration:
     closing = _with_all_points(problem, refined)
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause
-    covariance = _covariance(refined.uncertainty, length)
+    covariance = problem.known.conditional(_covariance(refined.uncertainty, length))
     if closing.settled is not None:
         last, covariance = closing.settled.pose, closing.settled.covariance
         refined = refined._replace(transform=last._replace(translation=last.translation / length))
@@ -278,7 +303,7 @@ def finished(problem: Problem, found: Found) -> ScanRegistration:
     success = verdict.is_success(chance, chances[1:], refined.converged)
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
-        for direction in weak_directions(refined.uncertainty)
+        for direction in weak_directions(problem.known.held(refined.uncertainty))
     )
     reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
     return assembled(
