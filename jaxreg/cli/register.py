@@ -37,6 +37,7 @@ def _path(**options):
 
 OptionalPath = Annotated[Path | None, _path()]
 Output = Annotated[Path | None, _path(aliases=["-o"])]
+Known = tyro.conf.UseAppendAction[tuple[Literal["upright", "inside"], ...]]
 Stable = Annotated[str, tyro.conf.arg(metavar="FILE|BOX", help_behavior_hint="")]
 Degrees = Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")]
 
@@ -67,9 +68,10 @@ class Register:
     max_rotation_deg: Degrees = None
     """Largest rotation between the scans in degrees (default: any); decides between the poses of
     symmetric objects."""
-    known: tuple[Literal["upright", "inside"], ...] = ()
+    known: Known = ()
     """What is known of the pair: "upright", both scans are level, so that the source is turned about
-    the axis --up alone; "inside", the source lies wholly in the reference, which shows far more."""
+    the axis --up alone; "inside", the source lies wholly in the reference, which shows far more. May
+    be given twice."""
     up: Literal["x", "y", "z"] = "z"
     """The axis that points upwards in both scans (with --known upright)."""
     scale: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
