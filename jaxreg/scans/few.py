@@ -63,7 +63,7 @@ def registered(
     accuracy = _accuracy(x, best, known, reference.centre)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])
-    alone = len(chances) == 1 or chances[1] < _RIVAL
+    alone = len(chances) == 1 or bool(chances[1] < _RIVAL)
     success = chance >= _TRUSTED and alone
     evidence = FewEvidence(
         len(best.pairs), min(len(x), len(y)), best.residual, best.log_chance / math.log(10)

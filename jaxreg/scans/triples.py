@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
@@ -24,11 +24,13 @@ _TOLERANCES = (1e-3, 4e-3, 1.6e-2, 5e-2)
 """Differences of lengths that are tried in turn, in diameters of the larger cloud."""
 EXACT = 1e-5
 """No residual counts as smaller, in diameters: what decides below it is rounding."""
-_WORK = 15_000_000
-"""Most comparisons of lengths at one tolerance: enough for all triples of 25 points, of more points for
-some of them."""
-_POSES = 12_000
-"""Most triples that are laid on one another at one tolerance."""
+_WORK = (1_000_000, 15_000_000)
+"""Most comparisons of lengths at one tolerance: first of a few of the triples, then, if these give no
+convincing pose, of all triples of 25 points and some of more."""
+_POSES = (3000, 12_000)
+"""Most triples that are laid on one another at one tolerance, first and then."""
+_ALL_AT_FIRST = 12
+"""Of so many points the first comparisons are of all triples."""
 _LOOKED_AT, _REFITTED = 400, 60
 """Poses with most pairs of which the pairs are looked at, and that are fitted to all of theirs."""
 _GLANCE = 16
@@ -120,28 +122,34 @@ def _is_flat(x: np.ndarray, y: np.ndarray, up: np.ndarray) -> bool:
 
 
 def _searched(problem: _Problem, max_rotation_deg: float) -> list[Solution]:
-    """The poses at the first tolerance that leaves room for the residual of the best one."""
+    """The poses at the first tolerance that leaves room for the residual of a convincing one."""
     found: list[Solution] = []
     if problem.diameter == 0:
         return found
-    few_first = len(problem.source) <= len(problem.reference)
-    for share in _TOLERANCES:
-        tolerance = share * problem.diameter
-        side = problem if few_first else problem.swapped
-        poses = _laid_on(side, tolerance)
-        if not few_first:
-            poses = _inverse(poses)
-        turned = rotation_angle_deg(poses.rotation, np.eye(3)[None])
-        poses = _chosen(poses, turned <= max_rotation_deg + 0.1)
-        if len(poses.rotation):
-            found = _best([_refitted(problem, poses, 2 * tolerance), found], problem)
-        if found and found[0].log_odds > 0 and tolerance > 4 * found[0].residual:
+    fewest = min(len(problem.source), len(problem.reference))
+    for effort in range(1 if fewest <= _ALL_AT_FIRST else 2):
+        for tolerance in problem.diameter * np.array(_TOLERANCES):
+            poses = _allowed(_laid_on(problem, float(tolerance), effort), max_rotation_deg)
+            if len(poses.rotation):
+                found = _best([_refitted(problem, poses, 2 * tolerance), found], problem)
+            if found and found[0].log_odds > 0 and tolerance > 4 * found[0].residual:
+                return found
+        if found and found[0].log_odds > 0:
             break
     return found
 
 
-def _laid_on(problem: _Problem, tolerance: float) -> RigidTransform:
+def _allowed(poses: RigidTransform, max_rotation_deg: float) -> RigidTransform:
+    """Those that turn by little enough; all of them where none does."""
+    rows = rotation_angle_deg(poses.rotation, np.eye(3)[None]) <= max_rotation_deg + 0.1
+    rows = rows if rows.any() else np.ones_like(rows)
+    return RigidTransform(poses.rotation[rows], poses.translation[rows])
+
+
+def _laid_on(problem: _Problem, tolerance: float, effort: int) -> RigidTransform:
     """A pose for every triple of the source and every triple of the reference with equal sides."""
+    if len(problem.source) > len(problem.reference):
+        return _inverse(_laid_on(problem.swapped, tolerance, effort))
     a, b = problem.source_lengths, problem.reference_lengths
     first, second = np.nonzero(~np.eye(len(b), dtype=bool))
     order = np.argsort(b[first, second])
@@ -149,7 +157,7 @@ def _laid_on(problem: _Problem, tolerance: float) -> RigidTransform:
     triples = _triples(problem)
     side = a[triples[:, 0], triples[:, 1]]
     low, high = (np.searchsorted(length, side + s * tolerance) for s in (-1, 1))
-    most = max(1, int(np.searchsorted(np.cumsum((high - low) * len(b)), _WORK)))
+    most = max(1, int(np.searchsorted(np.cumsum((high - low) * len(b)), _WORK[effort])))
     triples, low, high = triples[:most], low[:most], high[:most]
     row = np.repeat(np.arange(len(triples)), high - low)
     offset = np.arange(len(row)) - np.repeat(np.cumsum(high - low) - (high - low), high - low)
@@ -163,9 +171,9 @@ def _laid_on(problem: _Problem, tolerance: float) -> RigidTransform:
         )
         number, third = np.nonzero(fits)
         laid.append(np.stack([rows[number], one[number], other[number], third], axis=1))
-        if sum(map(len, laid)) > _POSES:
+        if sum(map(len, laid)) > _POSES[effort]:
             break
-    found = np.concatenate([*laid, np.zeros((0, 4), np.int64)])[:_POSES]
+    found = np.concatenate([*laid, np.zeros((0, 4), np.int64)])[: _POSES[effort]]
     x, y = problem.source[triples[found[:, 0]]], problem.reference[found[:, 1:]]
     return _fitted(x, y, problem.up)
 
@@ -314,12 +322,6 @@ def _differ(one: Solution, other: Solution, problem: _Problem) -> bool:
     apart = np.linalg.norm(apart + one.pose.translation - other.pose.translation, axis=1)
     least = max(one.residual, other.residual, EXACT * problem.diameter)
     return bool(apart.max() > max(_APART * least, 0.02 * problem.diameter))
-
-
-def _chosen(poses: RigidTransform, rows: Bool[np.ndarray, "b"]) -> RigidTransform:
-    """The poses of these rows; all of them where that leaves none."""
-    rows = rows if rows.any() else np.ones_like(rows)
-    return RigidTransform(poses.rotation[rows], poses.translation[rows])
 
 
 def _inverse(poses: RigidTransform) -> RigidTransform:
