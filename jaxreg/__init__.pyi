@@ -75,12 +75,13 @@ from . import peers as peers
 # Two scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud
 from .scans.config import RegisterConfig as RegisterConfig
-from .scans.pair import (
-    Alternative as Alternative,
-    ScanRegistration as ScanRegistration,
-    register as register,
-)
+from .scans.pair import register as register
 from .scans.prepare import Prepared as Prepared, prepare as prepare
+from .scans.result import (
+    Alternative as Alternative,
+    FewEvidence as FewEvidence,
+    ScanRegistration as ScanRegistration,
+)
 from .view.page import write_page as write_page, write_registration_page as write_registration_page
 from .view.pictures import plot_pair as plot_pair
 

@@ -25,7 +25,7 @@ from jaxreg.cli import process
 from jaxreg.data import data_root
 from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import WEIGHTS, features, probabilities
-from jaxreg.scans import candidates, pair, prepare
+from jaxreg.scans import candidates, prepare, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.verdict import TRUSTED
 from jaxreg.types import RigidTransform
@@ -97,15 +97,15 @@ def judged_poses(found: sensors.TruePair) -> dict:
     """The evidence of all poses that `register` may choose from, and which of them are right."""
     config = RegisterConfig()
     clouds = [prepare.prepare(cloud, config=config) for cloud in (found.source, found.reference)]
-    problem = pair.pose_problem(*clouds, config)
+    problem = surfaces.pose_problem(*clouds, config)
     searches = [
-        pair.searched_and_judged(problem, np.pi, search) for search in (config.search, config.wide)
+        surfaces.searched_and_judged(problem, search) for search in (config.search, config.wide)
     ]
-    if nearer := pair.closer(problem):
-        searches.append(pair.searched_and_judged(nearer, np.pi, config.wide))
+    if nearer := surfaces.closer(problem):
+        searches.append(surfaces.searched_and_judged(nearer, config.wide))
     judged = functools.reduce(candidates.merged, searches)
     poses = [
-        pair.frame.transform_out(problem.where, RigidTransform(*pose))
+        surfaces.frame.transform_out(problem.where, RigidTransform(*pose))
         for pose in zip(*judged.poses, strict=True)
     ]
     values = np.stack([np.asarray(leaf) for leaf in judged.evidence], axis=1)

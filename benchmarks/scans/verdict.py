@@ -25,7 +25,8 @@ from jaxreg.data import data_root, modelnet
 from jaxreg.data.procedural import shapes
 from jaxreg.data.seven_scenes import read_fragment
 from jaxreg.geometry.rigid import rotation_angle_deg
-from jaxreg.scans.pair import ScanRegistration, register
+from jaxreg.scans.pair import register
+from jaxreg.scans.result import ScanRegistration
 
 SOURCES = {"procedural": "procedural", "ModelNet40": "modelnet", "7Scenes": "scenes"}
 KINDS = {

@@ -19,7 +19,7 @@ from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
     from jaxreg.io import Scan
-    from jaxreg.scans.pair import ScanRegistration
+    from jaxreg.scans.result import ScanRegistration
 
 _CACHE_MISS = "/jax/compilation_cache/cache_misses"
 _COMPILING = (
@@ -37,6 +37,8 @@ def _path(**options):
 
 OptionalPath = Annotated[Path | None, _path()]
 Output = Annotated[Path | None, _path(aliases=["-o"])]
+Known = tyro.conf.UseAppendAction[tuple[Literal["upright", "inside"], ...]]
+Stable = Annotated[str, tyro.conf.arg(metavar="FILE|BOX", help_behavior_hint="")]
 Degrees = Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")]
 
 
@@ -66,6 +68,17 @@ class Register:
     max_rotation_deg: Degrees = None
     """Largest rotation between the scans in degrees (default: any); decides between the poses of
     symmetric objects."""
+    known: Known = ()
+    """What is known of the pair: "upright", both scans are level, so that the source is turned about
+    the axis --up alone; "inside", the source lies wholly in the reference, which shows far more. May
+    be given twice."""
+    up: Literal["x", "y", "z"] = "z"
+    """The axis that points upwards in both scans (with --known upright)."""
+    scale: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """The source may be at another size: estimate it, too."""
+    stable: Stable = ""
+    """Where the reference has not changed: a box x0,y0,x1,y1 or x0,y0,z0,x1,y1,z1 in its coordinates,
+    or a file with a number for each of its points (0: it moved). Only these points take part."""
     refine: Literal["gicp", "icp", "point_to_plane", "none"] = "gicp"
     """How to refine the pose that the search found."""
     nonfinite: Literal["raise", "drop"] = "raise"
@@ -116,10 +129,27 @@ def _registered(
         reference,
         initial=initial,
         max_rotation_deg=command.max_rotation_deg,
+        known=command.known,
+        up=command.up,
+        scale=command.scale,
+        mask=(None, _stable(command.stable, reference)) if command.stable else None,
         nonfinite=command.nonfinite,
         strays=command.strays,
         config=dataclasses.replace(command.config, refine=refinement),
     )
+
+
+def _stable(told: str, reference: np.ndarray) -> np.ndarray:
+    """Which points of the reference --stable names: those of a box, or of a file of numbers."""
+    from jaxreg import io
+    from jaxreg.scans import masks
+
+    numbers = told.replace(",", " ").split()
+    try:
+        box = [float(word) for word in numbers]
+    except ValueError:
+        return io.read_numbers(Path(told), len(reference)) != 0
+    return masks.in_box(reference, box)
 
 
 def _print_result(
@@ -204,15 +234,17 @@ def _write_results(
     from jaxreg import io
     from jaxreg.view import page
 
+    shown = source * result.scale
+
     def write_page(path: Path) -> None:
         names = (command.source.name, command.reference.name)
-        page.write_registration_page(path, source, reference, result, names=names)
+        page.write_registration_page(path, shown, reference, result, names=names)
 
     def draw(path: Path) -> None:
-        page.draw_registration(path, source, reference, result)
+        page.draw_registration(path, shown, reference, result)
 
     def write_moved(path: Path) -> None:
-        moved = (result.rotation, result.translation)
+        moved = (result.scale * result.rotation, result.translation)
         lost.extend(io.write_moved(path, command.source, *moved, points=source))
 
     writers: tuple[tuple[Path | None, Callable[[Path], None]], ...] = (

@@ -21,12 +21,17 @@ _FEWEST = 3
 
 
 def check_points(
-    points: object, name: str, *, nonfinite: Literal["raise", "drop"] = "raise"
+    points: object,
+    name: str,
+    *,
+    nonfinite: Literal["raise", "drop"] = "raise",
+    planar: bool = False,
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
     """`points` as float64 (n, 3), and which rows are finite.
 
     Also the points of an object that has some (Open3D, PyVista, trimesh), and the columns x, y, z of a
-    structured array or a table. Masked rows count as not finite, and are never refused.
+    structured array or a table. Masked rows count as not finite, and are never refused. If clouds may
+    be `planar`, (n, 2) is (n, 3) with z = 0.
 
     Raises:
       ValueError: not a numeric array of shape (n, 3), fewer than three (finite) points, a
@@ -36,6 +41,10 @@ def check_points(
         raise ValueError(f"nonfinite must be 'raise' or 'drop', got {nonfinite!r}.")
     given = foreign.points_of(points, name)
     array = _as_floats(given, name)
+    if planar and array.ndim == 2 and array.shape[1] == 2:
+        array = np.column_stack([array, np.zeros(len(array))])
+        if isinstance(given, np.ma.MaskedArray):
+            given = np.ma.array(array, mask=np.ma.getmaskarray(given)[:, [0, 1, 1]])
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"{name} has shape {array.shape}, {_reshaped(given, array.shape)}.")
     array, masked = foreign.unmasked(given, array)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.geometry import arguments
 from jaxreg.geometry.eigen3x3 import pseudo_inverse
+from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.types import RigidTransform
 
@@ -48,6 +49,38 @@ def weighted_procrustes(
         precision=Precision.HIGHEST,
     )
     rotation = special_procrustes(covariance)
+    rotated = jnp.matmul(rotation, source_centroid, precision=Precision.HIGHEST)
+    return RigidTransform(rotation, reference_centroid - rotated)
+
+
+def upright_procrustes(
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "n 3"],
+    weights: Float[Array, "n"],
+    up: Float[Array, "3"],
+) -> RigidTransform:
+    """`weighted_procrustes` among the turns about the unit vector `up`.
+
+    The angle ``atan2(up . sum_i w_i a_i x b_i, sum_i w_i (a_i . b_i - (a_i . up) (b_i . up)))`` of the
+    points a, b about their weighted centroids. If no weight is positive, the angle is 0.
+    """
+    weights = jnp.maximum(weights, 0)
+    total = jnp.sum(weights)
+    share = (weights / jnp.where(total > 0, total, 1))[:, None]
+    source_centroid = jnp.sum(share * source, axis=0)
+    reference_centroid = jnp.sum(share * reference, axis=0)
+    a, b = source - source_centroid[None, :], reference - reference_centroid[None, :]
+    along = jnp.sum(a * up[None, :], axis=1) * jnp.sum(b * up[None, :], axis=1)
+    cosine = jnp.sum(share[:, 0] * (jnp.sum(a * b, axis=1) - along))
+    sine = jnp.sum(share * jnp.cross(a, b) * up[None, :])
+    length = safe_sqrt(cosine**2 + sine**2)
+    cosine = jnp.where(length > 0, cosine / jnp.where(length > 0, length, 1), 1)
+    sine = jnp.where(length > 0, sine / jnp.where(length > 0, length, 1), 0)
+    x, y, z = up
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    outer = up[:, None] * up[None, :]
+    rotation = cosine * jnp.eye(3, dtype=a.dtype) + sine * cross + (1 - cosine) * outer
     rotated = jnp.matmul(rotation, source_centroid, precision=Precision.HIGHEST)
     return RigidTransform(rotation, reference_centroid - rotated)
 

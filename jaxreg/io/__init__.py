@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.io import arrays, e57, las, mesh, packed, pcd, ptx, text, unread
+from jaxreg.io.arrays import read_numbers
 from jaxreg.io.contents import Scan
 from jaxreg.io.matrix import read_matrix
 from jaxreg.io.merged import read_colors, write_merged
@@ -26,6 +27,7 @@ __all__ = [
     "read_cloud",
     "read_colors",
     "read_matrix",
+    "read_numbers",
     "read_pairs_log",
     "read_poses",
     "read_scan",

@@ -9,7 +9,7 @@ from jaxreg.io.contents import Scan
 
 
 def read(path: Path) -> Scan:
-    """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises.
+    """The points (n, 3), float64; (n, 2) gets z = 0. Raises what `jaxreg.io.read_cloud` raises.
 
     More columns than three (colours, intensity) are not read. In an NPZ file the array is `points`,
     or the only one that could be a cloud.
@@ -51,6 +51,27 @@ def read_arrays(
     return arrays
 
 
+def read_numbers(path: Path, count: int) -> np.ndarray:
+    """One number a point: text with one a line, or NPY.
+
+    Raises:
+      ValueError: there is no such file, it holds no numbers, or not `count` of them.
+    """
+    try:
+        loaded = _loaded(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, ndmin=1)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path.") from None
+    except Exception as error:  # noqa: BLE001 - numpy raises types of its own
+        told = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} holds no numbers ({told}): write one for each point.") from None
+    numbers = np.asarray(loaded)
+    if numbers.shape != (count,) or numbers.dtype.kind not in "bfiu":
+        raise ValueError(
+            f"{path} is {numbers.dtype} {numbers.shape}: write {count:,} numbers, one for each point."
+        )
+    return numbers
+
+
 def _loaded(path: Path) -> np.ndarray | dict[str, np.ndarray]:
     with path.open("rb") as file:
         content = np.load(file, allow_pickle=False)
@@ -80,6 +101,8 @@ def _points(array: np.ndarray, where: str) -> np.ndarray:
         )
     if array.dtype.kind in "fiu" and array.ndim == 3 and array.shape[2] == 3:
         return array.reshape(-1, 3).astype(np.float64)  # an organised cloud, (height, width, 3)
+    if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[1] == 2:
+        return np.column_stack([array, np.zeros(len(array))]).astype(np.float64)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] < 3:
         raise ValueError(
             f"{where} is {array.dtype} {array.shape}, not numbers of shape (n, 3): "

@@ -35,3 +35,9 @@ def _content(path: Path) -> object:
     # Brackets and commas too: what Python prints can be pasted.
     numbers = re.sub(r"#.*|[\[\],;]", " ", path.read_text("utf-8")).split()
     return np.array(numbers, float).reshape(4, 4)
+
+
+def turn_of(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation R of a matrix ``s R``: what turns normals, which keep their length."""
+    volume = float(np.linalg.det(matrix))
+    return matrix if abs(volume - 1) < 1e-9 else matrix / np.cbrt(volume)

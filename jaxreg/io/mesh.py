@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from jaxreg.io import ply, stl
 from jaxreg.io.contents import Scan
 from jaxreg.io.decoding import as_utf8, decoded, with_points
+from jaxreg.io.matrix import turn_of
 
 _POINTS = 20_000
 """Points drawn from a surface; a file without faces gives its vertices."""
@@ -138,7 +139,8 @@ def _write_obj(path: Path, original: Path, rotation: np.ndarray, translation: np
             words = line.split()
             if words and words[0] in ("v", "vn") and len(words) > 3:
                 numbers = [float(word.replace(",", ".")) for word in words[1:4]]
-                moved = rotation @ numbers + (translation if words[0] == "v" else 0)
+                vertex = words[0] == "v"
+                moved = rotation @ numbers + translation if vertex else turn_of(rotation) @ numbers
                 line = " ".join([words[0], *(f"{x:.12g}" for x in moved), *words[4:]])
             file.write(line + "\n")
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxreg.io import lzf
 from jaxreg.io.contents import Scan
 from jaxreg.io.decoding import as_utf8, number, with_points
+from jaxreg.io.matrix import turn_of
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMALS = ("normal_x", "normal_y", "normal_z")
@@ -69,7 +70,7 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
     for axis, column in zip("xyz", moved.T, strict=True):
         rows[axis] = column
     if set(_NORMALS) <= set(_names(file.row)):
-        normals = np.stack([old[name] for name in _NORMALS], axis=1) @ rotation.T
+        normals = np.stack([old[name] for name in _NORMALS], axis=1) @ turn_of(rotation).T
         for name, column in zip(_NORMALS, normals.T, strict=True):
             rows[name] = column
     return _write(path, rows, file.entries)
@@ -283,7 +284,7 @@ def _write_ascii(path: Path, file: _File, moved: np.ndarray, rotation: np.ndarra
             words = line.decode("latin-1").split()
             if across:
                 vector = [number(words[c]) or 0.0 for c in across]
-                for column, value in zip(across, rotation @ vector, strict=True):
+                for column, value in zip(across, turn_of(rotation) @ vector, strict=True):
                     words[column] = f"{value:.9g}"
             if np.isfinite(point).all():
                 for column, value in zip(places, point, strict=True):

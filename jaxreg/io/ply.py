@@ -10,6 +10,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from jaxreg.io.decoding import as_utf8, with_points
+from jaxreg.io.matrix import turn_of
 
 _END = re.compile(rb"end_header[ \t]*(\r\n|\n|\r)")
 _LONGEST = 1 << 20
@@ -226,6 +227,6 @@ def _moved(vertex: np.ndarray, rotation: np.ndarray, translation: np.ndarray) ->
         moved[axis] = column
     if set(_NORMALS) <= set(fields):
         normals = np.stack([vertex[name] for name in _NORMALS], axis=1)
-        for name, column in zip(_NORMALS, (normals @ rotation.T).T, strict=True):
+        for name, column in zip(_NORMALS, (normals @ turn_of(rotation).T).T, strict=True):
             moved[name] = column
     return moved

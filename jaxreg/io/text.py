@@ -10,9 +10,12 @@ import numpy as np
 from jaxreg.io.contents import Scan
 from jaxreg.io.decoding import decoded, number
 from jaxreg.io.layout import Layout, is_data, lines, recognised, split, uncommented
+from jaxreg.io.matrix import turn_of
 
 SUFFIXES = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzn", ".xyzrgb", ".xyzi", ".dat")
 WRITABLE = (".xyz", ".txt", ".csv", ".asc")
+_FEWEST = 3
+"""Fewer lines of two numbers may be anything."""
 _GRID = re.compile(r"\s*ncols\s+\d+\s+nrows\s+\d+", re.IGNORECASE)
 
 
@@ -24,7 +27,8 @@ def read(path: Path) -> Scan:
     [m]"), or as a surveyor does (Easting, Northing, Elevation); without a header the first three
     columns of numbers. A header that has a name for every column, and none of these, is an error, and
     so is a first column that seems to number the points. Other comments are skipped, and so are lines
-    with nothing but the number of points that follow. An empty field or "-nan(ind)" is NaN.
+    with nothing but the number of points that follow. An empty field or "-nan(ind)" is NaN. If every
+    line has two numbers, they are x and y, and z is 0.
     """
     text = decoded(path, path.read_bytes())
     if _GRID.match(text):
@@ -32,10 +36,32 @@ def read(path: Path) -> Scan:
             f"{path} is a grid of heights (ESRI), not a list of points: convert it first, as in "
             "gdal_translate -of XYZ grid.asc points.xyz."
         )
+    if (planar := _in_plane(text)) is not None:
+        return Scan(planar, ("two columns: z is 0",))
     layout = recognised(path, text)
     if layout is None:
         return Scan(np.empty((0, 3)))
     return Scan(_points(path, text, layout))
+
+
+def _in_plane(text: str) -> np.ndarray | None:
+    """The points of a file of x and y alone, with z = 0; None for any other file."""
+    rows = []
+    for _, line in lines(text):
+        if not is_data(line):
+            continue
+        line = uncommented(line).strip()
+        mark = next((mark for mark in ";|" if mark in line), None)
+        alone = "," in line and (len(line.split()) == 1 or ", " in line)
+        mark = mark or ("," if alone else None)
+        fields = [number(field, comma=mark == ";") for field in split(line, mark)]
+        if len(fields) != 2 or (None in fields and rows):
+            return None
+        if None not in fields:
+            rows.append(fields)
+    if len(rows) < _FEWEST:
+        return None
+    return np.column_stack([np.array(rows, np.float64), np.zeros(len(rows))])
 
 
 def write(path: Path, points: np.ndarray) -> None:
@@ -76,7 +102,9 @@ def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray
         fields = [parts[places[c]].strip().strip('"') for c in layout.normals]
         vector = [number(field, comma=layout.comma) for field in fields]
         if None not in vector:
-            new |= dict(zip(layout.normals, rotation @ np.array(vector, float), strict=True))
+            new |= dict(
+                zip(layout.normals, turn_of(rotation) @ np.array(vector, float), strict=True)
+            )
     for column, value in new.items():
         digits = f"{value:.12g}"
         parts[places[column]] = digits.replace(".", ",") if layout.comma else digits

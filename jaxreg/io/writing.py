@@ -84,9 +84,9 @@ def write_moved(
 ) -> tuple[str, ...]:
     """Write the file `source` with ``R x + t`` for its points; returns what the format cannot hold.
 
-    `points` are those of the source as `read_cloud` gives them. A mesh stays a mesh, with its
-    vertices moved. PLY, PCD, text and LAS keep all that a point carries where the format stays; other
-    formats get coordinates alone.
+    `rotation` may have a scale: normals are turned by its rotation alone. `points` are those of the
+    source as `read_cloud` gives them. A mesh stays a mesh, with its vertices moved. PLY, PCD, text
+    and LAS keep all that a point carries where the format stays; other formats get coordinates alone.
 
     Raises:
       ValueError: as `check_output`, or the source has changed meanwhile.

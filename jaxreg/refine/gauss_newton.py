@@ -29,10 +29,21 @@ def gauss_newton_step(
     moved: Float[Array, "p 3"],
     target: Float[Array, "p 3"],
     metric: Float[Array, "p 3 3"],
+    motions: Float[Array, "6 f"] | None = None,
 ) -> RigidTransform:
-    """The pose after one damped step on pairs `moved` (already under `pose`) and `target`."""
+    """The pose after one damped step on pairs `moved` (already under `pose`) and `target`.
+
+    `motions` is a basis of the motions (rotation vector, translation) that are unknown; None: all.
+    """
     information, gradient = normal_equations(moved, target, metric)
-    rotation, translation = jnp.split(-solve_damped(information, gradient), 2)
+    if motions is None:
+        step = -solve_damped(information, gradient)
+    else:
+        part = jnp.matmul(information, motions, precision=Precision.HIGHEST)
+        part = jnp.matmul(motions.T, part, precision=Precision.HIGHEST)
+        force = jnp.matmul(motions.T, gradient, precision=Precision.HIGHEST)
+        step = -jnp.matmul(motions, solve_damped(part, force), precision=Precision.HIGHEST)
+    rotation, translation = jnp.split(step, 2)
     rotation = _shortened(rotation, _LARGEST_ROTATION)
     return update_left(pose, rotation, _shortened(translation, _LARGEST_TRANSLATION))
 
@@ -63,12 +74,13 @@ def normal_equations(
 
 
 def solve_damped(
-    information: Float[Array, "6 6"], gradient: Float[Array, "6"]
-) -> Float[Array, "6"]:
+    information: Float[Array, "f f"], gradient: Float[Array, "f"]
+) -> Float[Array, "f"]:
     """``(H + d I)^-1 g`` with ``d`` in proportion to the mean of H's diagonal; 0 where H is 0."""
-    mean = jnp.trace(information) / 6
+    unknowns = information.shape[0]
+    mean = jnp.trace(information) / unknowns
     scale = jnp.where(mean > 0, mean, 1)
-    damped = information / scale + _DAMPING * jnp.eye(6, dtype=information.dtype)
+    damped = information / scale + _DAMPING * jnp.eye(unknowns, dtype=information.dtype)
     return jnp.matmul(inverse_definite(damped), gradient / scale, precision=Precision.HIGHEST)
 
 

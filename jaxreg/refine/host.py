@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_points
@@ -83,16 +84,18 @@ def refine_indexed(
     distance: float,
     config: RefineConfig,
     more: int = 0,
+    motions: Float[np.ndarray, "6 f"] | None = None,
 ) -> Refined:
     """The same for indexed clouds in one frame: nothing is checked, thinned, indexed or scaled again.
 
     `distance` is the largest between corresponding points, in the unit of the frame. A pose that
-    still moves after `config.iterations` has up to `more` of them.
+    still moves after `config.iterations` has up to `more` of them. `motions` is a basis of the unknown
+    motions (rotation vector, translation) in the frame; None: all of them.
     """
     check_options(config)
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
     pose, taken, converged, pairs = iterate(
-        initial, source, reference, weighting, config=config, more=more
+        initial, source, reference, weighting, config=config, more=more, motions=motions
     )
     # Until here it is orthogonal only to float32.
     pose = RigidTransform(nearest_rotation(pose.rotation), pose.translation)

@@ -19,6 +19,7 @@ from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs
 from jaxreg.refine.cost import Scene, match
+from jaxreg.refine.gauss_newton import gauss_newton_step
 from jaxreg.refine.methods import method_of
 from jaxreg.refine.robust import Weighting, widenings
 from jaxreg.types import RigidTransform
@@ -103,13 +104,15 @@ def iterate(
     config: RefineConfig,
     step: int = 1,
     more: int = 0,
+    motions: Float[np.ndarray, "6 f"] | None = None,
 ) -> tuple[RigidTransform, int, bool, Pairs]:
     """Pose (numpy), iterations taken, whether the last step was below tolerance, the last pairs.
 
     The kernel narrows to its final width. After a step below `config.tolerance` half of the
     remaining widths are skipped; at the final width all are. Up to `more` further iterations are
     made where the pose still moves: far at a wide kernel, at all at the final one. Only every
-    `step`-th point looks for a partner; large clouds first converge with fewer.
+    `step`-th point looks for a partner; large clouds first converge with fewer. `motions` is a basis of
+    the unknown motions (rotation vector, translation) in the frame; None: all of them.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
@@ -134,7 +137,7 @@ def iterate(
             )
             new = _step(
                 pose, source[3:], reference[3:], pairs, weighting.kernel_scale,
-                weighting.max_correspondence_distance, float(widths[i]), config=settings,
+                weighting.max_correspondence_distance, float(widths[i]), motions, config=settings,
             )  # fmt: skip
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
             change = _change(pose, new)
@@ -159,6 +162,7 @@ def iterate_all(
     *,
     config: RefineConfig,
     step: int = 1,
+    motions: Float[np.ndarray, "6 f"] | None = None,
 ) -> RigidTransform:
     """All iterations of `config` for many poses (leading axis, numpy) at once.
 
@@ -173,7 +177,7 @@ def iterate_all(
         )  # fmt: skip
         poses = _steps(
             poses, source[3:], reference[3:], pairs, weighting.kernel_scale,
-            weighting.max_correspondence_distance, float(width), config=settings,
+            weighting.max_correspondence_distance, float(width), motions, config=settings,
         )  # fmt: skip
         poses = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), poses)
     return poses
@@ -226,23 +230,33 @@ def _described(points, neighbors, given):
 
 
 @partial(jax.jit, static_argnames="config")
-def _steps(poses, source, reference, pairs, kernel_scale, distance, width, *, config: RefineConfig):
+def _steps(
+    poses, source, reference, pairs, kernel_scale, distance, width, motions, *, config: RefineConfig
+):
     def one(pose_and_pairs):
         pose, pairs = pose_and_pairs
-        return _step(pose, source, reference, pairs, kernel_scale, distance, width, config=config)
+        return _step(
+            pose, source, reference, pairs, kernel_scale, distance, width, motions, config=config
+        )
 
     return jax.lax.map(one, (poses, pairs))
 
 
 @partial(jax.jit, static_argnames="config")
-def _step(pose, source, reference, pairs, kernel_scale, distance, width, *, config: RefineConfig):
+def _step(
+    pose, source, reference, pairs, kernel_scale, distance, width, motions, *, config: RefineConfig
+):
     (x, *source_shape, source_scale), (y, *reference_shape, reference_scale) = source, reference
     weighting = Weighting(config.kernel, kernel_scale, distance, config.trim)
     pose = RigidTransform(*(leaf.astype(x.dtype) for leaf in pose))
     here, there = (_surface(shape, config) for shape in (source_shape, reference_shape))
     scene = Scene(x * source_scale, y * reference_scale, here, there, weighting)
     method = method_of(config)
-    return method.step(pose, match(scene, pose, pairs, method, width))
+    matched = match(scene, pose, pairs, method, width)
+    if motions is None:
+        return method.step(pose, matched)
+    basis = motions.astype(x.dtype)
+    return gauss_newton_step(pose, matched.moved, matched.target, matched.metric, basis)
 
 
 def _surface(shape, config: RefineConfig):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
 from jaxreg.judge.evidence import REACH, Evidence, read_evidence
@@ -15,7 +15,7 @@ from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
 from jaxreg.types import RigidTransform
 
-_APART_DEG, _APART = 6.0, 0.1
+APART_DEG, APART = 6.0, 0.1
 """Poses nearer to each other than this (in the unit of the frame) are one and the same."""
 _REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)
 """How a pose is refined before it is judged: surfaces a spacing apart say little."""
@@ -65,6 +65,32 @@ class Clouds(NamedTuple):
         return evidence, np.asarray(score, np.float64)[:count]
 
 
+def read(
+    poses: RigidTransform,
+    examined: tuple[Examined, Examined],
+    scales: tuple[float, float],
+    there: Int[np.ndarray, "k n"],
+    back: Int[np.ndarray, "k m"],
+) -> Evidence:
+    """The evidence for poses whose nearest points are known: see `jaxreg.judge.read_evidence`."""
+    count = len(poses.rotation)
+    poses = _padded(poses)
+    there, back = (
+        np.pad(
+            np.concatenate([index, index[-1:].repeat(len(poses.rotation) - count, 0)]),
+            [(0, 0), (0, len(cloud.mask) - index.shape[1])],
+        ).astype(np.int32)
+        for index, cloud in zip((there, back), examined, strict=True)
+    )
+    evidence, _ = _read(poses, *examined, scales, there, back)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
+
+
+def odds(evidence: Evidence) -> Float[np.ndarray, "k"]:
+    """The log odds of evidence in numpy."""
+    return np.asarray(log_odds(evidence), np.float64)
+
+
 def _padded(poses: RigidTransform) -> RigidTransform:
     """The poses, the last one repeated up to one of a few counts."""
     count = len(poses.rotation)
@@ -91,6 +117,7 @@ def judged(
     *,
     distance: float,
     most: int,
+    motions: Float[np.ndarray, "6 f"] | None = None,
 ) -> Judged:
     """At most `most` distinct ones of the poses, the best by `score`, refined and judged.
 
@@ -104,7 +131,13 @@ def judged(
     chosen = _distinct(poses, score, most)
     poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
     moved = iterate_all(
-        _padded(poses), clouds.source, clouds.reference, weighting, config=_REFINE, step=_STEP
+        _padded(poses),
+        clouds.source,
+        clouds.reference,
+        weighting,
+        config=_REFINE,
+        step=_STEP,
+        motions=motions,
     )
     count = len(chosen)
     poses = RigidTransform(nearest_rotation(moved.rotation[:count]), moved.translation[:count])
@@ -129,6 +162,6 @@ def _distinct(poses: RigidTransform, score: np.ndarray, most: int) -> list[int]:
             break
         turned = rotation_angle_deg(poses.rotation[chosen], poses.rotation[i][None])
         moved = np.linalg.norm(poses.translation[chosen] - poses.translation[i], axis=1)
-        if np.all((turned > _APART_DEG) | (moved > _APART)):
+        if np.all((turned > APART_DEG) | (moved > APART)):
             chosen.append(i)
     return chosen

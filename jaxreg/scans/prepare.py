@@ -143,11 +143,11 @@ def prepare(
 ) -> Prepared:
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
-    `cloud` is array-like (n, 3). `normals` (n, 3), of any length and sign, replace the computed
-    ones; give zeros where unknown. `strays` are a few points ten times as far from the middle as
-    all others (`Prepared.notes` tells of them): they are left out, take part, or are an error;
-    centre and radius are those of the others in any case. `config` must be that of the
-    registration, and `name` is how messages refer to the cloud.
+    `cloud` is array-like (n, 3), or (n, 2) in the plane z = 0. `normals` (n, 3), of any length and
+    sign, replace the computed ones; give zeros where unknown. `strays` are a few points ten times as
+    far from the middle as all others (`Prepared.notes` tells of them): they are left out, take part,
+    or are an error; centre and radius are those of the others in any case. `config` must be that of
+    the registration, and `name` is how messages refer to the cloud.
 
     Raises:
       ValueError: the cloud is not a numeric (n, 3) array with at least three finite points (the
@@ -155,7 +155,7 @@ def prepare(
         and `strays` is "raise".
     """
     config = RegisterConfig() if config is None else config
-    array, kept = check_points(cloud, name, nonfinite=nonfinite)
+    array, kept = check_points(cloud, name, nonfinite=nonfinite, planar=True)
     across = None if normals is None else check_normals(normals, kept, name)
     far, notes = _strays(array[kept], strays, name)
     if strays == "drop":
@@ -172,6 +172,17 @@ def prepare(
     return Prepared(
         points, across, centre, radius or 1.0, kept, row, notes, fine, coarse, config
     )  # fmt: skip
+
+
+def part(cloud: Prepared, rows: Bool[np.ndarray, "n"], config: RegisterConfig) -> Prepared:
+    """The cloud of these rows of the input alone; rows of it that were dropped stay dropped.
+
+    Its own rows are those that are left.
+    """
+    chosen = cloud.row[rows[cloud.kept]]
+    points = cloud.points[chosen] * cloud.radius + cloud.centre
+    across = None if cloud.normals is None else cloud.normals[chosen]
+    return prepare(points, normals=across, strays="keep", config=config)
 
 
 def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from jaxreg.graph import se3
 from jaxreg.io.poses import Edges
 from jaxreg.scans.many import Alignment
-from jaxreg.scans.pair import ScanRegistration
 from jaxreg.scans.relation import Relation
+from jaxreg.scans.result import ScanRegistration
 
 _PER_POINT = ("confidence", "correspondences")
 _MENTIONED = 0.05
@@ -33,9 +33,13 @@ def figures(result: ScanRegistration) -> dict[str, str]:
     deviations = np.sqrt(np.maximum(np.diag(result.covariance), 0))
     turn, shift = math.degrees(deviations[:3].max()), deviations[3:].max()
     known = bool(np.isfinite(deviations).all())
+    size = (
+        {"scale": f"{result.scale:.6g} +- {result.scale_sigma:.2g}"} if result.scale_sigma else {}
+    )
     return {
         "rotation": f"{angle:.3f} deg",
         "translation": ", ".join(f"{x:.9g}" for x in result.translation),
+        **size,
         "overlap": f"{result.overlap:.2f}",
         "fitness": f"{result.fitness:.2f} within {result.max_correspondence_distance:.4g}",
         "inlier rmse": f"{result.inlier_rmse:.4g}",

@@ -1,6 +1,7 @@
 """Whether a pose is to be trusted, and what speaks against it, in words."""
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import WEIGHTS, features
@@ -8,6 +9,8 @@ from jaxreg.refine.uncertainty import WeakDirection
 
 TRUSTED = 0.5
 """Probability from which a registration counts as a success."""
+RIVAL = 0.25
+"""A pose is no success if another one is right with this probability: several agree then."""
 _LEAST_HELD = 1e-5
 """Below it the clouds leave a motion free, as planes do: no pose is the right one then."""
 _USUAL = Evidence(
@@ -28,6 +31,12 @@ def is_free(found: Evidence) -> bool:
     return bool(found.held < _LEAST_HELD)
 
 
+def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | None) -> bool:
+    """Whether a pose is to be trusted, from its probability and those of the others."""
+    alone = len(rivals) == 0 or float(np.max(rivals)) < RIVAL
+    return chance >= TRUSTED and alone and converged is not False
+
+
 def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> str:
     """Why a pose is not trusted: the evidence that falls shortest of a usual right pose.
 
@@ -36,7 +45,7 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> s
     if is_free(found):
         free = ", ".join(direction.name for direction in weak) or "a motion"
         return f"The surfaces leave the pose free: {free}."
-    if rivals >= 0.25:
+    if rivals >= RIVAL:
         return "Another pose agrees about as well (see alternatives)."
     short = np.array(WEIGHTS) * (np.array(features(found)) - np.array(features(_USUAL)))
     # The sentence of a field whose fitted weight has the other sign would say what is not the case.

@@ -33,12 +33,14 @@ def align_coarse(
     reference: Surface,
     grid: NearestGrid,
     *,
+    motions: Float[Array, "6 f"] | None = None,
     widths: tuple[float, ...] = COARSE_WIDTHS,
     epsilon: float = COARSE_EPSILON,
 ) -> RigidTransform:
     """One Gauss-Newton step for each of `widths`; neighbours from the grid, source to reference.
 
     The metric ``n n^T + epsilon I`` is that of point to plane, with a hold where planes would slide.
+    `motions`: as of `gauss_newton_step`.
     """
     outer = reference.normals[:, :, None] * reference.normals[:, None, :]
     metric = outer + epsilon * jnp.eye(3, dtype=outer.dtype)[None]
@@ -49,7 +51,7 @@ def align_coarse(
         target = reference.points[nearest]
         weight = jnp.where(source.mask, _closeness(moved - target, width), 0)
         weighted = weight[:, None, None] * metric[nearest]
-        return gauss_newton_step(pose, moved, target, weighted), None
+        return gauss_newton_step(pose, moved, target, weighted, motions), None
 
     return jax.lax.scan(step, pose, jnp.asarray(widths, source.points.dtype))[0]
 
@@ -59,6 +61,7 @@ def align_fine(
     source: Surface,
     reference: Surface,
     *,
+    motions: Float[Array, "6 f"] | None = None,
     widths: tuple[float, ...] = FINE_WIDTHS,
     epsilon: float = FINE_EPSILON,
 ) -> RigidTransform:
@@ -88,7 +91,7 @@ def align_fine(
         residual = moved[i] - reference.points[j]
         weight = jnp.where(valid, _closeness(residual, width), 0)
         weighted = weight[:, None, None] * metric
-        return gauss_newton_step(pose, moved[i], reference.points[j], weighted), None
+        return gauss_newton_step(pose, moved[i], reference.points[j], weighted, motions), None
 
     return jax.lax.scan(step, pose, jnp.asarray(widths, source.points.dtype))[0]
 

@@ -24,6 +24,7 @@ def compatibility(
     reference_normals: Float[Array, "c 3"],
     mask: Bool[Array, "c"],
     *,
+    up: Float[Array, "3"] | None = None,
     tolerance: float = DISTANCE_TOLERANCE,
     cosine_tolerance: float = COSINE_TOLERANCE,
 ) -> Float[Array, "c c"]:
@@ -31,12 +32,22 @@ def compatibility(
 
     The product of ``max(0, 1 - (e / tolerance)^2)`` over the change e of the distance, of
     ``|n_i . n_k|``, of ``|n_i . u_ik|`` and of ``|n_k . u_ik|`` (u from i to k; normals have no sign).
+    If both clouds are level (`up`, a unit vector), also of the difference in height, and of the slope
+    ``|n . up|`` of each of the two candidates.
     """
     invariants = _invariants(source, source_normals, tolerance)
     others = _invariants(reference, reference_normals, tolerance)
     agrees = _agreement(invariants[0] - others[0], tolerance)
     for one, other in zip(invariants[1:], others[1:], strict=True):
         agrees = agrees * _agreement(one - other, cosine_tolerance)
+    if up is not None:
+        rise, other_rise = _rises(source, up), _rises(reference, up)
+        slope, other_slope = (
+            jnp.abs(jnp.matmul(normals, up, precision=Precision.HIGHEST))
+            for normals in (source_normals, reference_normals)
+        )
+        level = _agreement(slope - other_slope, cosine_tolerance)
+        agrees = agrees * _agreement(rise - other_rise, tolerance) * level[:, None] * level[None, :]
     different = ~jnp.eye(source.shape[0], dtype=bool)
     return jnp.where(different & mask[:, None] & mask[None, :], agrees, 0)
 
@@ -75,6 +86,11 @@ def _invariants(points: Array, normals: Array, tolerance: float) -> tuple[Array,
     # The direction of a short line is noise, so its slope is drawn towards zero.
     shorter = 1 / (length + tolerance / 2)
     return length, dot(n_i, n_k), dot(n_i, line) * shorter, dot(n_k, line) * shorter
+
+
+def _rises(points: Array, up: Array) -> Array:
+    height = jnp.matmul(points, up, precision=Precision.HIGHEST)
+    return height[None, :] - height[:, None]
 
 
 def _agreement(change: Array, tolerance: float) -> Array:

@@ -9,7 +9,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry.neighbors import squared_distances
-from jaxreg.geometry.procrustes import weighted_procrustes
+from jaxreg.geometry.procrustes import upright_procrustes, weighted_procrustes
 from jaxreg.search.compatibility import second_order, spectral_weights
 from jaxreg.search.nearest import NearestGrid, lookup
 from jaxreg.search.surface import Surface
@@ -39,13 +39,15 @@ def pose_hypotheses(
     *,
     seeds: int,
     consensus_size: int = CONSENSUS_SIZE,
+    up: Float[Array, "3"] | None = None,
 ) -> RigidTransform:
     """One pose (leading axis s) from each of the first `seeds` candidates.
 
     It is that of the candidate and of the `consensus_size` others that agree with it best, ranked by
     second-order compatibility; the weights of the Procrustes solution are the leading eigenvector of
     the compatibility among them. The seeds are the clearest candidates, not those that agree with
-    most others: when nine in ten are wrong, that loses the right ones.
+    most others: when nine in ten are wrong, that loses the right ones. With `up` (a unit vector) the
+    poses turn about it alone.
     """
     among = second_order(first, seeds)
     _, members = jax.lax.top_k(among, consensus_size)
@@ -56,7 +58,10 @@ def pose_hypotheses(
     members = jnp.concatenate([own, members], axis=1)
     local = first[members[:, :, None], members[:, None, :]]
     weights = spectral_weights(local)
-    return jax.vmap(weighted_procrustes)(source[members], reference[members], weights)
+    pairs = source[members], reference[members], weights
+    if up is not None:
+        return jax.vmap(upright_procrustes, in_axes=(0, 0, 0, None))(*pairs, up)
+    return jax.vmap(weighted_procrustes)(*pairs)
 
 
 def screen(

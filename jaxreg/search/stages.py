@@ -76,6 +76,7 @@ class _Problem(NamedTuple):
     examined: tuple[Examined, Examined] | None
     sparsity: Float[Array, ""]
     max_angle: Float[Array, ""] | float
+    motions: Float[Array, "6 f"] | None
 
 
 def search_described(
@@ -86,12 +87,14 @@ def search_described(
     similarity: Float[Array, "n m"] | None = None,
     also: RigidTransform | None = None,
     max_angle: Float[Array, ""] | float = math.pi,
+    up: Float[Array, "3"] | None = None,
     config: SearchConfig = _DEFAULT,
 ) -> Search:
     """`search_poses` of clouds that were described before, both in one unit.
 
     The poses map the points of `source` to those of `reference` as they are in these records: about
-    their own origins, in units of the search. So does `also`.
+    their own origins, in units of the search. So does `also`. With `up`, a unit vector that points
+    upwards in both clouds, the poses turn about it alone.
 
     Raises:
       ValueError: what `search_poses` raises.
@@ -108,10 +111,18 @@ def search_described(
         (_examined(source), _examined(reference)) if config.judged else None,
         sparsity_factor(source.spacing, reference.spacing),
         max_angle,
+        None if up is None else _upright_motions(up),
     )
-    poses = _screened(_hypotheses(compared, config), also, problem, config)
+    poses = _screened(_hypotheses(compared, up, config), also, problem, config)
     poses = _shortlisted(_coarsely_aligned(poses, problem), problem, config)
     return _ranked(_finely_aligned(poses, problem), problem)
+
+
+def _upright_motions(up: Float[Array, "3"]) -> Float[Array, "6 4"]:
+    zero = jnp.zeros_like(up)
+    turn = jnp.concatenate([up, zero])[:, None]
+    shifts = jnp.concatenate([jnp.zeros((3, 3), up.dtype), jnp.eye(3, dtype=up.dtype)])
+    return jnp.concatenate([turn, shifts], axis=1)
 
 
 def _examined(cloud: Described) -> Examined:
@@ -139,7 +150,9 @@ def _check_search(source: Described, reference: Described, similarity, also, max
         )
 
 
-def _hypotheses(compared: Compared, config: SearchConfig) -> RigidTransform:
+def _hypotheses(
+    compared: Compared, up: Float[Array, "3"] | None, config: SearchConfig
+) -> RigidTransform:
     source, reference, similarity = jax.lax.stop_gradient(compared)
     candidates = select_candidates(similarity, source.mask, reference.mask, keep=config.candidates)
     i, j = candidates.source_index, candidates.reference_index
@@ -149,6 +162,7 @@ def _hypotheses(compared: Compared, config: SearchConfig) -> RigidTransform:
         source.normals[i],
         reference.normals[j],
         candidates.mask,
+        up=up,
     )
     return pose_hypotheses(
         source.points[i],
@@ -156,6 +170,7 @@ def _hypotheses(compared: Compared, config: SearchConfig) -> RigidTransform:
         first,
         seeds=min(config.seeds, len(i)),
         consensus_size=min(CONSENSUS_SIZE, len(i) - 1),
+        up=up,
     )
 
 
@@ -165,7 +180,7 @@ def _screened(
     """The distinct best hypotheses by their overlap in both directions, `also` the first of them."""
     if also is not None:
         poses = jax.tree.map(lambda one, all: jnp.concatenate([one[None], all]), also, poses)
-    source, reference, grids, *_, max_angle = problem
+    source, reference, grids, *_, max_angle, _ = problem
     score = screen(poses, thinned(source, _COARSE_STEP), reference, grids[1])
     back = jax.vmap(rigid.inverse)(poses)
     score = score + screen(back, thinned(reference, _COARSE_STEP), source, grids[0])
@@ -179,9 +194,11 @@ def _screened(
 
 def _coarsely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
     few = thinned(problem.source, _COARSE_STEP)
-    return jax.vmap(lambda pose: align_coarse(pose, few, problem.reference, problem.grids[1]))(
-        poses
-    )
+    return jax.vmap(
+        lambda pose: align_coarse(
+            pose, few, problem.reference, problem.grids[1], motions=problem.motions
+        )
+    )(poses)
 
 
 def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig) -> RigidTransform:
@@ -194,7 +211,7 @@ def _shortlisted(poses: RigidTransform, problem: _Problem, config: SearchConfig)
 
 
 def _score_at_a_glance(pose: RigidTransform, problem: _Problem) -> Float[Array, ""]:
-    source, reference, grids, _, sparsity, _ = problem
+    source, reference, grids, _, sparsity, *_ = problem
     terms = score_terms_by_grid(
         pose, source, reference, grids, step=_COARSE_STEP, sparsity=sparsity
     )
@@ -212,7 +229,7 @@ def _odds_at_a_glance(pose: RigidTransform, problem: _Problem) -> Float[Array, "
 
 def _finely_aligned(poses: RigidTransform, problem: _Problem) -> RigidTransform:
     few, fewer = (thinned(s, _COARSE_STEP) for s in (problem.source, problem.reference))
-    return jax.lax.map(lambda pose: align_fine(pose, few, fewer), poses)
+    return jax.lax.map(lambda pose: align_fine(pose, few, fewer, motions=problem.motions), poses)
 
 
 def _ranked(poses: RigidTransform, problem: _Problem) -> Search:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxreg.scans import summary
-from jaxreg.scans.pair import Alternative, ScanRegistration
+from jaxreg.scans.result import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000

@@ -10,7 +10,7 @@ from jaxreg.judge.evidence import Evidence, read_evidence
 from jaxreg.judge.odds import log_odds
 from jaxreg.scans import candidates, prepare
 from jaxreg.scans.config import RegisterConfig
-from jaxreg.scans.pair import pose_problem
+from jaxreg.scans.surfaces import pose_problem
 from jaxreg.search.nearest import nearest_packed
 from jaxreg.types import RigidTransform
 from tests.judge.clouds import assert_same, random_pose

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import summary
-from jaxreg.scans.pair import Alternative, ScanRegistration
+from jaxreg.scans.result import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
 
 SLIDE = WeakDirection("translation", np.array([1.0, 0, 0]), np.zeros(3), 1e-4)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
-from jaxreg.scans.pair import Alternative, ScanRegistration
+from jaxreg.scans.result import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
 from jaxreg.view import page
 

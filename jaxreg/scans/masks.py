@@ -1,0 +1,76 @@
+"""Which points take part, and how much they count, for callers who know what moved."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxreg.scans.prepare import Prepared
+
+
+def masks_of(mask: object, counts: tuple[int, int]) -> tuple[Bool[np.ndarray, "n"], ...]:
+    """The masks of source and reference: one is of the source, a pair is of both (None: all points).
+
+    Raises:
+      ValueError: a mask is not of booleans, one for each row of its cloud, or leaves fewer than three.
+    """
+    pair = mask if isinstance(mask, tuple | list) and len(mask) == 2 else (mask, None)
+    return tuple(
+        _mask(part, count, name)
+        for part, count, name in zip(pair, counts, ("source", "reference"), strict=True)
+    )
+
+
+def _mask(mask: object, count: int, name: str) -> Bool[np.ndarray, "n"]:
+    if mask is None:
+        return np.ones(count, bool)
+    array = np.asarray(mask)
+    if array.dtype != bool or array.shape != (count,):
+        raise ValueError(
+            f"the mask of the {name} is {array.dtype} {array.shape}: give {count} booleans, one for "
+            "each of its points (True: the point takes part), or a pair of masks (source, reference)."
+        )
+    if array.sum() < 3:
+        raise ValueError(f"the mask of the {name} leaves {array.sum()} points: a pose needs 3.")
+    return array
+
+
+def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
+    """How much every point of the source counts.
+
+    Raises:
+      ValueError: not a finite number of 0 or more for each row, or fewer than three are positive.
+    """
+    try:
+        array = np.asarray(weights, np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (count,) or not (np.isfinite(array).all() and np.all(array >= 0)):
+        raise ValueError(
+            f"weights must be {count} numbers of 0 or more, one for each point of the source, got "
+            f"shape {array.shape}."
+        )
+    if np.sum(array > 0) < 3:
+        raise ValueError("weights are positive for fewer than 3 points: a pose needs 3.")
+    return array
+
+
+def of_points(values: Float[np.ndarray, "n"], cloud: Prepared) -> Float[np.ndarray, "p"]:
+    """The mean of the values of the rows that are one of the distinct points, for each of these."""
+    count = np.bincount(cloud.row, minlength=len(cloud.points))
+    return np.bincount(cloud.row, values[cloud.kept], len(cloud.points)) / np.maximum(count, 1)
+
+
+def in_box(points: Float[np.ndarray, "n 3"], box: Sequence[float]) -> Bool[np.ndarray, "n"]:
+    """Which points lie in a box ``(x0, y0, x1, y1)`` or ``(x0, y0, z0, x1, y1, z1)``.
+
+    Raises:
+      ValueError: it is neither, or a first corner lies beyond the second.
+    """
+    half = len(box) // 2
+    if len(box) not in (4, 6) or any(a >= b for a, b in zip(box[:half], box[half:], strict=True)):
+        raise ValueError(
+            f"a box is x0,y0,x1,y1 or x0,y0,z0,x1,y1,z1 with x0 < x1 and so on, got {tuple(box)}."
+        )
+    low, high = np.array(box[:half]), np.array(box[half:])
+    return np.all((points[:, :half] >= low) & (points[:, :half] <= high), axis=1)

@@ -1,0 +1,110 @@
+"""Two scans of which one is at another size: photogrammetry without a scale, a model in another unit.
+
+The size is one more unknown. It is tried in steps that a search of rigid poses bridges, and estimated
+where the pose is right, on the distances from the planes of the other cloud, with its deviation.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxreg.scans import planes
+from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.known import Known
+from jaxreg.scans.prepare import Prepared
+from jaxreg.scans.result import ScanRegistration, centred, out_of, resized
+from jaxreg.types import RigidTransform
+
+_STEP = 1.12
+"""Ratio of neighbouring sizes: a search finds poses of clouds whose sizes differ by half of it."""
+_EACH_WAY = 5
+"""Steps from the ratio of the radii, up and down: to a factor of 1.8."""
+_SURE = 0.9
+"""No more sizes are tried at this probability."""
+_SAMPLE = 6000
+_ITERATIONS, _ROUNDS = 24, 2
+_CUT = 4.685
+_REACH = 0.1
+"""How far off points may lie at the size that was tried, in radii of the reference."""
+
+Run = Callable[[Prepared, Prepared, RegisterConfig, RigidTransform | None, Known], ScanRegistration]
+
+
+def registered(
+    source: Prepared,
+    reference: Prepared,
+    config: RegisterConfig,
+    start: RigidTransform | None,
+    known: Known,
+    *,
+    run: Run,
+    flat: bool,
+) -> ScanRegistration:
+    """The registration with the scale as an unknown; `run` is that of clouds of one size.
+
+    With a `start` the size is sought from 1 on.
+    """
+    if start is not None:
+        size, pose = 1.0, start
+    else:
+        size, pose = _tried(source, reference, config, known, run)
+    for _ in range(_ROUNDS):
+        change, pose, sigma = _fitted((resized(source, size), reference), pose, known, flat)
+        size *= change
+    found = run(resized(source, size), reference, config, pose, known)
+    return dataclasses.replace(
+        found,
+        transformation=np.block(
+            [[size * found.rotation, found.translation[:, None]], [0, 0, 0, 1]]
+        ),
+        scale=size,
+        scale_sigma=size * sigma,
+    )
+
+
+def _tried(
+    source: Prepared, reference: Prepared, config: RegisterConfig, known: Known, run: Run
+) -> tuple[float, RigidTransform]:
+    """The size at which the pose is likeliest, and that pose."""
+    ratio = reference.radius / source.radius
+    steps = sorted(range(-_EACH_WAY, _EACH_WAY + 1), key=abs)
+    quick = dataclasses.replace(config, wide=None)
+    best, size, pose = -1.0, ratio, RigidTransform(np.eye(3), np.zeros(3))
+    for step in steps:
+        tried = ratio * _STEP**step
+        found = run(resized(source, tried), reference, quick, None, known)
+        if found.probability > best:
+            best, size, pose = found.probability, tried, found.transform
+        if best >= _SURE:
+            break
+    return size, pose
+
+
+def _fitted(
+    clouds: tuple[Prepared, Prepared], pose: RigidTransform, known: Known, flat: bool
+) -> tuple[float, RigidTransform, float]:
+    """The size and pose at which most points lie on the other surface; the size's relative sigma."""
+    source, reference = clouds
+    unit = reference.radius
+    inner = centred(clouds, pose)
+    rows = np.linspace(0, len(source.points) - 1, min(_SAMPLE, len(source.points))).astype(int)
+    whole, count = (reference.points, reference.tree), 8 if flat else planes.NEIGHBORS
+    some = source.points[rows] * (source.radius / unit)
+    motions = np.eye(6)[:, [2, 3, 4]] if flat else known.motions
+    patches = planes.patches(*whole, reference.points[:: max(1, len(reference.points) // 2000)])
+    narrowest = min(_CUT * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
+    found = planes.fitted(
+        some,
+        whole,
+        RigidTransform(inner.rotation, inner.translation / unit),
+        np.geomspace(_REACH, narrowest, _ITERATIONS),
+        motions=motions,
+        scale=1.0,
+        count=count,
+        flat=flat,
+    )
+    # Of the clouds as given: the centre of the source moves with its size.
+    resized_clouds = resized(source, found.scale), reference
+    fit = RigidTransform(found.pose.rotation, found.pose.translation * unit)
+    return found.scale, out_of(resized_clouds, fit), float(np.sqrt(found.covariance[6, 6]))

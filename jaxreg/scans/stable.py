@@ -1,0 +1,134 @@
+"""The part that stayed decides: where a share of the points moved, the last stage leaves it out.
+
+After a landslide, or with some trees felled, most of two scans agrees to the noise and the rest lies
+off by less than the spacing of the few points that a pose is refined with. There a robust kernel is
+wider than the change, and the pose is drawn along. With many points the kernel can be as narrow as
+the noise.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from jaxreg.scans import planes
+from jaxreg.scans.known import Known
+from jaxreg.scans.prepare import Prepared
+from jaxreg.types import RigidTransform
+
+_FIRST, _SECOND = 4000, 24_000
+"""Points of the source while the kernel narrows, and at the end."""
+_NARROWING, _STEADY, _ROUNDS = 16, 4, 3
+"""Iterations while it narrows, at the end, and how often the latter are made."""
+_NEIGHBORS = 6
+"""Points of a patch at the end: where the surface is curved, a smaller patch is nearer to it."""
+_CUT, _INNER = 4.685, 3.0
+"""Where Tukey's kernel ends, in standard deviations of the noise, first and last."""
+_AROUND = 16
+"""Points around a point that tell whether the surface moved there."""
+_STAYED, _MOVED = 1.25, 2.0
+"""Where their median distance is so many times that of the noise, it did not, or it did."""
+_GAIN = 1.02
+"""A pose is taken if so many times as many points agree with it."""
+_LEAST = 1e-9
+
+
+class Settled(NamedTuple):
+    """A pose of the centred clouds in the unit of the input, and its covariance about the origin.
+
+    `stayed` is the share of the compared points on which it rests, `gain` how many times as many
+    points agree to within the noise as did before.
+    """
+
+    pose: RigidTransform
+    covariance: Float[np.ndarray, "6 6"]
+    stayed: float
+    gain: float
+
+    @property
+    def better(self) -> bool:
+        """Whether clearly more points agree than before."""
+        return self.gain >= _GAIN
+
+
+def settled(
+    source: Prepared,
+    reference: Prepared,
+    pose: RigidTransform,
+    reach: float,
+    *,
+    known: Known,
+) -> Settled:
+    """The pose on which the largest part agrees to the noise, from `pose` on.
+
+    Both are of the centred clouds in the unit of the input, in which points may lie `reach` off.
+    """
+    unit, motions = reference.radius, known.motions
+    whole = reference.points, reference.tree
+    start = RigidTransform(pose.rotation, pose.translation / unit)
+    few, many = _rows(source, _FIRST), _rows(source, _SECOND)
+    first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
+    given = np.ones(len(source.points)) if known.weights is None else known.weights
+    noise = _noise(source, reference)
+    widths = np.geomspace(max(reach / unit, _CUT * noise), _CUT * noise, _NARROWING)
+    found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
+    around = np.asarray(cKDTree(second).query(second, k=min(_AROUND, len(second)), workers=-1)[1])
+    at = {"motions": motions, "count": _NEIGHBORS}
+    narrow = np.geomspace(_CUT, _INNER, _STEADY)
+    stays = given[many]
+    for _ in range(_ROUNDS):
+        found = planes.fitted(second, whole, found.pose, np.zeros(0), **at)
+        noise = max(_core(found.off[found.over & (given[many] > 0)]), _LEAST)
+        stays = given[many] * _stayed(found.off, around, noise)
+        found = planes.fitted(second, whole, found.pose, noise * narrow, weights=stays, **at)
+    wider = planes.fitted(second, whole, found.pose, 1.5 * noise * narrow[-1:], weights=stays, **at)
+    before = planes.fitted(second, whole, start, np.zeros(0), **at)
+    agree, agreed = (np.sum(one.over & (np.abs(one.off) < 3 * noise)) for one in (found, before))
+    # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
+    drawn = _difference(wider.pose, found.pose)
+    covariance = found.covariance[:6, :6] + np.outer(drawn, drawn)
+    units = np.repeat([1.0, unit], 3)
+    return Settled(
+        RigidTransform(found.pose.rotation, found.pose.translation * unit),
+        covariance * np.outer(units, units),
+        float(np.mean(stays[found.over] > 0.5)) if found.over.any() else 0.0,
+        float(agree / max(agreed, 1)),
+    )
+
+
+def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
+    return np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int)
+
+
+def _noise(source: Prepared, reference: Prepared) -> float:
+    """The median thickness of small pieces of surface, in radii of the reference; of both clouds."""
+    levels = []
+    for cloud in (source, reference):
+        found = planes.patches(cloud.points, cloud.tree, cloud.points[_rows(cloud, _FIRST)])
+        levels.append(np.median(found.noise) * cloud.radius / reference.radius)
+    return max(float(np.hypot(*levels)), _LEAST)
+
+
+def _stayed(
+    off: Float[np.ndarray, "p"], around: Int[np.ndarray, "p k"], noise: float
+) -> Float[np.ndarray, "p"]:
+    """1 where the surface around a point lies where it was, 0 where it moved.
+
+    Of points that moved some lie on the other surface by chance; those around them do not.
+    """
+    typical = np.median(np.abs(off)[around], axis=1) / (0.6745 * noise)
+    return planes.tukey(np.maximum(typical - _STAYED, 0) / (_MOVED - _STAYED))
+
+
+def _core(off: Float[np.ndarray, "p"]) -> float:
+    """The standard deviation of normal errors with this lower quartile of the distance from zero."""
+    return float(np.quantile(np.abs(off), 0.25)) / 0.3186 if len(off) else 0.0
+
+
+def _difference(one: RigidTransform, other: RigidTransform) -> Float[np.ndarray, "6"]:
+    """The small motion (rotation vector, translation) about the origin from one pose to another."""
+    change = other.rotation @ one.rotation.T
+    skew = (change - change.T) / 2
+    vector = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    return np.concatenate([vector, other.translation - change @ one.translation])

@@ -1,0 +1,367 @@
+"""Register two scans of surfaces: search, refine, judge, and look at all points."""
+
+import dataclasses
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxreg.geometry import frame
+from jaxreg.geometry.clouds import padded_size
+from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.judge.evidence import Evidence
+from jaxreg.judge.odds import probabilities
+from jaxreg.refine.host import Refined, refine_indexed, unrefined
+from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
+from jaxreg.scans import candidates, dense, diagnosis, prepare, stable, verdict
+from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.known import Known
+from jaxreg.scans.prepare import Prepared
+from jaxreg.scans.result import (
+    LISTED,
+    Accuracy,
+    Alternative,
+    ScanRegistration,
+    Verdict,
+    assembled,
+)
+from jaxreg.search.config import SearchConfig
+from jaxreg.search.learned import load_features
+from jaxreg.search.stages import search_described
+from jaxreg.types import RigidTransform
+
+_SMALLEST = 512
+"""Smallest size of a padded cloud in the search."""
+_TURN_COST = 0.2
+"""Log odds that half a turn costs in the choice of a pose: of poses that agree equally well (a
+symmetric shape) the one that turns least is taken."""
+SURE = 0.9
+"""Probability at which the search ends, because an easy pair needs no wider one."""
+_NOTHING = Known()
+_UNLIKE_SIZES = 2.0
+"""Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
+_FIRST, _WIDE = 4, 16
+"""Distinct poses that are refined and judged, after the first search and after the wider one."""
+_MORE = 200
+"""Further iterations of the refinement for a pose that still moves."""
+
+
+class Problem(NamedTuple):
+    """Two prepared clouds in one frame; points within `distance` count as the same.
+
+    `levels` and `unit` are what the search compares, and its unit in that of the input.
+    """
+
+    source: Prepared
+    reference: Prepared
+    where: frame.Frame
+    levels: tuple[prepare.Level, prepare.Level]
+    unit: float
+    spacing: float
+    distance: float
+    config: RegisterConfig
+    known: Known
+
+    def clouds(self) -> candidates.Clouds:
+        """Both fine levels in the frame."""
+        sides = (self.source, self.reference)
+        source, reference = (side.in_frame(side.fine, self.where) for side in sides)
+        return candidates.Clouds(
+            source, reference, (sides[0].fine.examined, sides[1].fine.examined)
+        )
+
+    @property
+    def motions(self) -> Float[np.ndarray, "6 f"] | None:
+        """A basis of the unknown motions, None if nothing is known of them."""
+        return None if self.known.up is None else self.known.motions
+
+    def reach(self) -> float:
+        """The largest distance between corresponding points of the fine levels, in the frame."""
+        clouds, length = (self.source, self.reference), float(self.where.length)
+        spacings = (cloud.fine.spacing * cloud.radius / length for cloud in clouds)
+        return self.config.refine_spacings * min(self.spacing, max(prepare.FINEST, *spacings))
+
+
+class Found(NamedTuple):
+    """The chosen pose in the frame, the others with their log odds, and how likely it is right."""
+
+    pose: RigidTransform
+    others: tuple[tuple[RigidTransform, float], ...]
+    probability: float = 1.0
+
+
+def registered(
+    source: Prepared,
+    reference: Prepared,
+    config: RegisterConfig,
+    start: RigidTransform | None,
+    known: Known,
+    least: float = 0.0,
+) -> ScanRegistration:
+    """The registration of two scans of surfaces; see `pair.register_prepared` for `least`."""
+    problem = pose_problem(source, reference, config, known)
+    if start is None:
+        return finished(problem, searched(problem), least)
+    return finished(problem, Found(frame.transform_in(problem.where, start), ()))
+
+
+def pose_problem(
+    source: Prepared, reference: Prepared, config: RegisterConfig, known: Known = _NOTHING
+) -> Problem:
+    """Two prepared clouds in one frame."""
+    length = math.hypot(source.radius, reference.radius) / math.sqrt(2)
+    where = frame.Frame(source.centre, reference.centre, length)
+    levels = prepare.at_one_density(source, reference)
+    sides = zip(levels, (source, reference), strict=True)
+    spacing = max(
+        prepare.FINEST, *(level.spacing * cloud.radius / length for level, cloud in sides)
+    )
+    distance = config.inlier_spacings * spacing
+    # Twice the radius: a usual shape then fills the unit sphere.
+    unit = prepare.in_steps(2 * length)
+    return Problem(source, reference, where, levels, unit, spacing, distance, config, known)
+
+
+def searched(problem: Problem) -> Found:
+    """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
+    config, most = problem.config, math.radians(problem.known.max_rotation_deg)
+    found = searched_and_judged(problem, config.search)
+    if config.wide is not None and probabilities(found.score).max() < SURE:
+        found = candidates.merged(found, searched_and_judged(problem, config.wide))
+        if (nearer := closer(problem)) and probabilities(found.score).max() < SURE:
+            found = candidates.merged(found, searched_and_judged(nearer, config.wide))
+    turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
+    # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
+    # the others is at least an answer.
+    allowed = turned <= most + 1e-3
+    allowed = allowed if allowed.any() else np.ones_like(allowed)
+    best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
+    poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
+    others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
+    return Found(
+        poses[best],
+        tuple((poses[i], float(found.score[i])) for i in others),
+        float(probabilities(found.score)[best]),
+    )
+
+
+def closer(problem: Problem) -> Problem | None:
+    """The pair in the unit of the smaller cloud and at the density that shows it, if sizes differ."""
+    radii = sorted((problem.source.radius, problem.reference.radius))
+    if radii[1] < _UNLIKE_SIZES * radii[0]:
+        return None
+    levels = prepare.at_fine_density(problem.source, problem.reference)
+    return problem._replace(levels=levels, unit=prepare.in_steps(2 * radii[0]))
+
+
+def searched_and_judged(problem: Problem, search: SearchConfig) -> candidates.Judged:
+    """The distinct poses of one search, refined and judged."""
+    first = search == problem.config.search
+    learned = problem.config.learned or not first
+    poses, score = searched_poses(problem, search, learned=learned)
+    most_poses = _FIRST if first else _WIDE
+    return candidates.judged(
+        problem.clouds(),
+        poses,
+        score,
+        distance=problem.reach(),
+        most=most_poses,
+        motions=problem.motions,
+    )
+
+
+def searched_poses(
+    problem: Problem, search: SearchConfig, *, learned: bool
+) -> tuple[RigidTransform, np.ndarray]:
+    """The poses of the search in the pair's frame (float64), and their scores; the allowed ones."""
+    where, unit, most = problem.where, problem.unit, math.radians(problem.known.max_rotation_deg)
+    sizes = [padded_size(len(level.points), smallest=_SMALLEST) for level in problem.levels]
+    # One size for both, so that few programs are compiled, unless one cloud is far larger.
+    sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
+    sides = zip(problem.levels, sizes, (problem.source, problem.reference), strict=True)
+    described = (
+        level.described(unit / cloud.radius, size, search.radii) for level, size, cloud in sides
+    )
+    unmoved = frame.transform_in(
+        where._replace(length=unit), RigidTransform(np.eye(3), np.zeros(3))
+    )
+    # Clouds that lie farther apart than float32 reaches do not overlap as they are anyway.
+    also = RigidTransform(*(np.clip(part, -1e6, 1e6).astype(np.float32) for part in unmoved))
+    up = None if problem.known.up is None else problem.known.up.astype(np.float32)
+    search = search if up is None else _eased(search)
+    found = _program(search, learned)(*described, also, np.float32(most), up)
+    poses = RigidTransform(*(np.asarray(part, np.float64) for part in found.poses))
+    scale = unit / float(where.length)
+    poses = poses._replace(translation=poses.translation * scale)
+    chosen = np.flatnonzero(found.allowed)
+    # If no pose is allowed, the best of the others is at least an answer.
+    chosen = chosen if len(chosen) else np.arange(len(found.allowed))
+    poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
+    return poses, np.asarray(found.score)[chosen]
+
+
+def _eased(search: SearchConfig) -> SearchConfig:
+    """Where both scans are level, half as many poses are enough."""
+    return dataclasses.replace(
+        search,
+        seeds=max(1, search.seeds // 2),
+        screened=max(1, search.screened // 2),
+        aligned=max(1, search.aligned // 2),
+    )
+
+
+@functools.cache
+def _program(search: SearchConfig, learned: bool):
+    def run(network, source, reference, also, max_angle, up):
+        return search_described(
+            source, reference, network=network, also=also, max_angle=max_angle, up=up, config=search
+        )
+
+    network = jax.device_put(load_features()) if learned else None
+    return functools.partial(jax.jit(run), network)
+
+
+def refine_pose(problem: Problem, pose: RigidTransform) -> Refined:
+    """The pose refined with more points than the search had, or as it is."""
+    config = problem.config
+    if config.refine is None:
+        return unrefined(pose)
+    given = config.refine.max_correspondence_distance
+    distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
+    source, reference, _ = problem.clouds()
+    return refine_indexed(
+        source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE,
+        motions=problem.motions,
+    )  # fmt: skip
+
+
+class _Closing(NamedTuple):
+    """What all points say of a pose: a better one if there is one, why it is wrong, what to note."""
+
+    settled: stable.Settled | None = None
+    cause: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        if self.settled is None:
+            return ()
+        moved = 1 - self.settled.stayed
+        return (f"{moved:.0%} of the points moved or changed: the pose rests on the others",)
+
+
+def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
+    """The last stage where parts have moved; where that is not why points disagree, the cause."""
+    source, reference = problem.source, problem.reference
+    pose = _lengthened(refined.transform, problem.where)
+    now = dense.at_a_glance(source, reference, pose)
+    weights = problem.known.weights
+    if weights is None and not (now.suspicious or now.drawn):
+        return _Closing()
+    settled = None
+    if problem.config.refine is not None:
+        reach = problem.reach() * float(problem.where.length)
+        settled = stable.settled(source, reference, pose, reach, known=problem.known)
+        settled = settled if settled.better or weights is not None else None
+    if settled is not None:
+        pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
+    return _Closing(settled, _another_cause(problem, pose, now) if now.suspicious else "")
+
+
+def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
+    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
+    source, reference, config = problem.source, problem.reference, problem.config
+    reach = problem.distance * float(problem.where.length)
+    scale, then = dense.at_another_size(source, reference, pose, reach)
+    if told := dense.size_text(scale, now, then):
+        return told
+    mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
+    twin = pose_problem(mirrored, reference, config)
+    other = _lengthened(refine_pose(twin, searched(twin).pose).transform, twin.where)
+    if dense.agreement(mirrored, reference, other).explains(now):
+        return "The mirrored source fits better."
+    return ""
+
+
+def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
+    """A pose in the frame as one of the centred clouds in the unit of the input."""
+    return RigidTransform(pose.rotation, pose.translation * float(where.length))
+
+
+def finished(problem: Problem, found: Found, least: float = 0.0) -> ScanRegistration:
+    """The chosen pose refined, looked at with all points, and judged beside the others."""
+    hopeless = found.probability < least
+    refined = unrefined(found.pose) if hopeless else refine_pose(problem, found.pose)
+    closing = _Closing() if hopeless else _with_all_points(problem, refined)
+    source, where = problem.source, problem.where
+    length, cause = float(where.length), closing.cause
+    covariance = problem.known.conditional(_covariance(refined.uncertainty, length))
+    if closing.settled is not None:
+        last, covariance = closing.settled.pose, closing.settled.covariance
+        refined = refined._replace(transform=last._replace(translation=last.translation / length))
+    evidence, score = problem.clouds().judge(
+        jax.tree.map(lambda leaf: leaf[None], refined.transform)
+    )
+    judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
+    chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
+    chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
+    success = verdict.is_success(chance, chances[1:], refined.converged)
+    weak = tuple(
+        direction._replace(point=where.reference_centre + length * direction.point)
+        for direction in weak_directions(problem.known.held(refined.uncertainty))
+    )
+    reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
+    return assembled(
+        (source, problem.reference),
+        _lengthened(refined.transform, where),
+        Verdict(success, chance, "" if success else reason, judged),
+        Accuracy(covariance, weak, refined.converged),
+        distance=problem.distance * length,
+        overlap=_overlap(problem, refined.transform),
+        alternatives=tuple(
+            Alternative(frame.transform_out(where, other), float(likely))
+            for (other, _), likely in zip(found.others, chances[1:], strict=True)
+            if likely >= LISTED
+        ),
+        notes=closing.notes,
+    )
+
+
+def _reason(
+    problem: Problem,
+    refined: Refined,
+    judged: Evidence,
+    weak: tuple[WeakDirection, ...],
+    rivals: float,
+) -> str:
+    """Why the pose is not trusted, and whether the clouds seem to be in different units."""
+    source, reference = (c.points * c.radius for c in (problem.source, problem.reference))
+    units = diagnosis.compared(source, reference, least=3.0)
+    moving = f"The pose was still moving after {refined.iterations} iterations of the refinement."
+    return " ".join(
+        [
+            moving if refined.converged is False else verdict.reason(judged, weak, rivals),
+            *(f"{told[:1].upper()}{told[1:]}." for told in units),
+        ]
+    )
+
+
+def _overlap(problem: Problem, pose: RigidTransform) -> float:
+    """Share of the points of both clouds, at one density, within reach of the other."""
+    sides = zip(problem.levels, (problem.source, problem.reference), strict=True)
+    source, reference = (cloud.in_frame(level, problem.where) for level, cloud in sides)
+    within = problem.distance
+    there = reference.nearest(source.moved_by(pose), within=within)[0]
+    back = source.nearest(reference.moved_back_by(pose), within=within)[0]
+    distances = np.concatenate([there, back])
+    return float(np.mean(distances < problem.distance))
+
+
+def _covariance(uncertainty: PoseUncertainty, length: float) -> Float[np.ndarray, "6 6"]:
+    """About the centroid of the reference, which is the origin of the frame; NaN if unknown."""
+    if not uncertainty.weight > 0:
+        return np.full((6, 6), np.nan)
+    units = np.repeat([1.0, length], 3)
+    return about(uncertainty, np.zeros(3)).covariance * np.outer(units, units)
