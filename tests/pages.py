@@ -28,7 +28,7 @@ def run_shell(code: str) -> str | None:
 
     None for other programs, and for training and evaluation, which take minutes: they are not run.
     """
-    if not re.match(r"jaxreg (register|info|view) ", code):
+    if not re.match(r"jaxreg (register|align|info|view) ", code):
         return None
     status = 0
     with (

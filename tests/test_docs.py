@@ -24,7 +24,12 @@ ROOT = Path(__file__).parents[1]
 DOCS = {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
 PAGES = {name: path for name, path in DOCS.items() if BLOCK.search(path.read_text("utf-8"))}
 # What these need is compiled by no other test; the other pages run in every suite.
-SLOW = ("read-the-results", "register-two-scans", "use-it-inside-your-jax-code")
+SLOW = (
+    "align-many-scans",
+    "read-the-results",
+    "register-two-scans",
+    "use-it-inside-your-jax-code",
+)
 NOTEBOOKS = {path.stem: path for path in sorted((ROOT / "examples").glob("*.ipynb"))}
 
 

@@ -1,0 +1,82 @@
+"""The pure solver against the one on the host, and its implicit derivative against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxreg.graph import se3
+from jaxreg.graph.optimize import optimize_poses
+from jaxreg.graph.pose_graph import truncated_weights
+from jaxreg.graph.sparse import solve_poses
+from tests.graph.graphs import graph_of, perturbed, random_poses, ring
+from tests.graph.test_sparse import first_from
+
+NODES = 6
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """A ring of six with noisy edges, two of twelve wrong, and poses to start from."""
+    rng = np.random.default_rng(5)
+    truth = random_poses(rng, NODES)
+    graph = graph_of(rng, truth, *ring(NODES), sigma=0.03)
+    return graph, first_from(perturbed(rng, truth, 0.1), truth), truth
+
+
+@pytest.fixture(scope="module")
+def solve():
+    """Translations, and their derivative in a direction of all measured transforms: one program."""
+
+    def solve(graph, start, direction, robust):
+        def poses(scale):
+            transform = se3.composed(graph.transform, se3.exp(scale * direction))
+            return optimize_poses(graph._replace(transform=transform), start, robust=robust)
+
+        found = poses(jnp.zeros(()))
+        slope = jax.jacfwd(lambda scale: poses(scale).poses.translation)(jnp.zeros(()))
+        return found, slope
+
+    return jax.jit(solve, static_argnames="robust")
+
+
+def direction(seed=0):
+    return np.random.default_rng(seed).normal(size=(2 * NODES, 6))
+
+
+def test_minimum_and_derivative_are_those_of_the_host(problem, solve):
+    graph, start, _ = problem
+    step = 1e-4
+
+    def host(scale):
+        transform = se3.composed(graph.transform, se3.exp(scale * direction()))
+        return solve_poses(graph._replace(transform=transform), start, tolerance=1e-15).poses
+
+    found, slope = solve(graph, start, direction(), False)
+    np.testing.assert_allclose(found.poses.translation, host(0.0).translation, atol=1e-8)
+    np.testing.assert_allclose(found.poses.rotation, host(0.0).rotation, atol=1e-8)
+    assert found.decrement < 1e-10
+    expected = (host(step).translation - host(-step).translation) / (2 * step)
+    np.testing.assert_allclose(slope, expected, atol=1e-5)
+    assert np.abs(expected).max() > 0.1
+
+
+@pytest.mark.slow
+def test_wrong_edges_are_left_out(problem, solve):
+    graph, start, truth = problem
+    rng = np.random.default_rng(3)
+    wrong = graph_of(rng, truth, graph.reference, graph.source, sigma=0.01, wrong=2)
+    found, _ = solve(wrong, start, direction(), True)
+    np.testing.assert_array_equal(np.round(found.weights[:2], 3), 0)
+    assert found.weights[2:].min() > 0.9
+    np.testing.assert_allclose(found.poses.translation, truth.translation, atol=0.05)
+
+
+def test_truncated_weights_go_from_all_to_in_or_out():
+    """By the definition: the minimiser of w r^2 + mu (1 - w) / (mu + w) c^2 over w in [0, 1]."""
+    squared, threshold = np.array([0.1, 0.9, 1.1, 4.0, 100.0]), 1.0
+    grid = np.linspace(0, 1, 200_001)
+    for control in (0.01, 0.5, 3.0, 100.0):
+        cost = grid[:, None] * squared + control * (1 - grid[:, None]) / (control + grid[:, None]) * threshold
+        expected = grid[np.argmin(cost, axis=0)]
+        np.testing.assert_allclose(truncated_weights(squared, threshold, control), expected, atol=2e-5)
