@@ -220,7 +220,7 @@ def _refitted(problem: _Problem, poses: RigidTransform, reach: float) -> list[So
             break
         pose = RigidTransform(poses.rotation[index], poses.translation[index])
         pairs = _partners(problem, pose, reach)[0]
-        key = pairs.tobytes()
+        key = pairs[np.argsort(pairs[:, 0])].tobytes()
         # Most of the poses of one solution have the same pairs.
         if len(pairs) < 3 or key in seen:
             continue

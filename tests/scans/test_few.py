@@ -102,7 +102,7 @@ def test_layouts_that_repeat_themselves_have_alternatives(rng, layout, poses):
 
 
 def test_unrelated_points_are_no_success():
-    for seed in range(8):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         assert not register(targets(rng, 8), targets(rng, 9)).success, seed
 
@@ -110,7 +110,7 @@ def test_unrelated_points_are_no_success():
 def test_the_evidence_counts_what_chance_gives():
     """Of unrelated points few reach what one in a thousand does: see `triples`."""
     chances = []
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         found = triples.solutions(targets(rng, 6), targets(rng, 6))
         chances.append(found[0].log_chance if found else np.inf)
@@ -153,7 +153,7 @@ def test_stems_on_a_plan(rng):
 def test_covariance_covers_the_error():
     """Squared errors over the variances: a mean of one for each of the six unknowns."""
     ratios = []
-    for seed in range(24):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         points = targets(rng, 10)
         reference, rotation = turned(rng, points, noise=0.02)
