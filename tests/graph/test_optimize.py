@@ -77,6 +77,11 @@ def test_truncated_weights_go_from_all_to_in_or_out():
     squared, threshold = np.array([0.1, 0.9, 1.1, 4.0, 100.0]), 1.0
     grid = np.linspace(0, 1, 200_001)
     for control in (0.01, 0.5, 3.0, 100.0):
-        cost = grid[:, None] * squared + control * (1 - grid[:, None]) / (control + grid[:, None]) * threshold
+        cost = (
+            grid[:, None] * squared
+            + control * (1 - grid[:, None]) / (control + grid[:, None]) * threshold
+        )
         expected = grid[np.argmin(cost, axis=0)]
-        np.testing.assert_allclose(truncated_weights(squared, threshold, control), expected, atol=2e-5)
+        np.testing.assert_allclose(
+            truncated_weights(squared, threshold, control), expected, atol=2e-5
+        )
