@@ -135,10 +135,11 @@ class Problem(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The chosen pose in the frame, and the others with their log odds."""
+    """The chosen pose in the frame, the others with their log odds, and how likely it is right."""
 
     pose: RigidTransform
     others: tuple[tuple[RigidTransform, float], ...]
+    probability: float = 1.0
 
 
 def register(
@@ -169,15 +170,36 @@ def register(
     config = RegisterConfig() if config is None else config
     _check_options(max_rotation_deg, config)
     start = None if initial is None else check_pose(initial, "initial")
-    problem = pose_problem(
+    return register_prepared(
         _prepared(source, "source", nonfinite, strays, config),
         _prepared(reference, "reference", nonfinite, strays, config),
         config,
+        start=start,
+        max_rotation_deg=max_rotation_deg,
     )
+
+
+def register_prepared(
+    source: Prepared,
+    reference: Prepared,
+    config: RegisterConfig,
+    *,
+    start: RigidTransform | None = None,
+    max_rotation_deg: float | None = None,
+    least: float = 0.0,
+) -> ScanRegistration:
+    """`register` of clouds that were prepared with `config`, or with one that differs in `wide` only.
+
+    A pose whose probability is below `least` after the search is left as the search had it.
+    """
+    problem = pose_problem(source, reference, config)
     if start is None:
         found = _search(problem, max_rotation_deg)
     else:
         found = _Found(frame.transform_in(problem.where, start), ())
+    if found.probability < least:
+        refined = unrefined(found.pose)
+        return _result(problem, refined, found, "")
     refined = _refine(problem, found.pose)
     return _result(problem, refined, found, _another_cause(problem, refined.transform))
 
@@ -241,7 +263,11 @@ def _search(problem: Problem, max_rotation_deg: float | None) -> _Found:
     best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
     poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
     others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
-    return _Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
+    return _Found(
+        poses[best],
+        tuple((poses[i], float(found.score[i])) for i in others),
+        float(probabilities(found.score)[best]),
+    )
 
 
 def closer(problem: Problem) -> Problem | None:
@@ -319,7 +345,7 @@ def _another_cause(problem: Problem, pose: RigidTransform) -> str:
     """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
     source, reference, config = problem.source, problem.reference, problem.config
     pose = _lengthened(pose, problem.where)
-    now = dense.agreement(source, reference, pose)
+    now = dense.at_a_glance(source, reference, pose)
     if not now.suspicious:
         return ""
     reach = problem.distance * float(problem.where.length)

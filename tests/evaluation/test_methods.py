@@ -43,7 +43,10 @@ def angle_deg(found, truth):
     return np.degrees(Rotation.from_matrix(turn).magnitude())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n == "register_global_learned")) for n in NAMES],
+)
 def test_every_name_is_a_method_of_a_batch_and_of_two_clouds(name, pair):
     method = chosen(name)
     outcome = method.clouds(pair.source.points, pair.reference.points)

@@ -29,6 +29,7 @@ HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training
 HOST |= {"peers.dcp.load_weights", "peers.cemnet.load_weights"}
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
+HOST |= {"network.batch.register_batch", "exported.export_program", "exported.load_exported"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
 ELSEWHERE |= {"peers.idam.loss", "peers.rpmnet.loss"}
