@@ -74,7 +74,6 @@ def measure(method: str, column: str, options: Options, root: Path | None) -> di
         f"{column}_median": found["median_rre_deg"],
         f"{column}_recall": found["recall_5deg"],
         f"{column}_worst": found["worst_rre_deg"],
-        f"{column}_ms": 1e3 * found["seconds_per_pair"],
     }
     print(method, {key: float(f"{value:.3g}") for key, value in cell.items()}, flush=True)
     return cell
@@ -88,7 +87,6 @@ def write(rows: dict[str, dict], options: Options) -> Path:
         "median": "median",
         "recall": "recall 5 deg",
         "worst": "worst",
-        "ms": "ms a pair",
     }
     return record.write(
         "peers",
