@@ -31,7 +31,9 @@ def perturbed(rng, transform: RigidTransform, sigma) -> RigidTransform:
 def graph_of(rng, poses, reference, source, *, sigma=0.0, wrong=0) -> PoseGraph:
     """Edges with noise; the first `wrong` ones are any transform instead."""
     transform = perturbed(rng, between(poses, reference, source), sigma)
-    transform.rotation[:wrong] = Rotation.random(wrong, random_state=rng).as_matrix() if wrong else 0
+    transform.rotation[:wrong] = (
+        Rotation.random(wrong, random_state=rng).as_matrix() if wrong else 0
+    )
     transform.translation[:wrong] = rng.normal(size=(wrong, 3))
     information = np.repeat(np.eye(6)[None], len(source), 0) / max(sigma, 1e-2) ** 2
     source, reference = (np.asarray(side, np.int32) for side in (source, reference))

@@ -40,8 +40,12 @@ def test_half_turns_have_a_logarithm(seed):
     for axis in (*np.eye(3), np.array([0.6, 0.8, 0]), rng.normal(size=3)):
         omega = np.pi * axis / np.linalg.norm(axis)
         back = se3.exp(se3.log(se3.exp(np.concatenate([omega, [1, 2, 3]]))))
-        np.testing.assert_allclose(back.rotation, se3.exp(np.append(omega, [0, 0, 0])).rotation, atol=1e-9)
-        np.testing.assert_allclose(back.translation, se3.exp(np.append(omega, [1, 2, 3])).translation, atol=1e-9)
+        np.testing.assert_allclose(
+            back.rotation, se3.exp(np.append(omega, [0, 0, 0])).rotation, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            back.translation, se3.exp(np.append(omega, [1, 2, 3])).translation, atol=1e-9
+        )
 
 
 def test_adjoint_carries_twists(seed):
@@ -84,6 +88,8 @@ def test_jax_and_numpy_give_the_same(seed):
 def test_derivatives_are_finite_at_the_identity_and_at_half_a_turn():
     turns = np.stack([np.eye(3), np.diag([1.0, -1, -1])])
     poses = RigidTransform(jnp.asarray(turns), jnp.ones((2, 3)))
-    slope = jax.jit(jax.grad(lambda pose: jnp.sum(se3.log(pose)) + jnp.sum(se3.exp(0 * se3.log(pose))[1])))
+    slope = jax.jit(
+        jax.grad(lambda pose: jnp.sum(se3.log(pose)) + jnp.sum(se3.exp(0 * se3.log(pose))[1]))
+    )
     for leaf in jax.tree.leaves(slope(poses)):
         assert np.isfinite(leaf).all()

@@ -39,7 +39,9 @@ def test_minimum_is_that_of_scipy(seed):
     found = solve_poses(graph, first_from(truth, truth))
 
     def cost(step):
-        moved = se3.composed(found.poses, se3.exp(np.concatenate([np.zeros(6), step]).reshape(-1, 6)))
+        moved = se3.composed(
+            found.poses, se3.exp(np.concatenate([np.zeros(6), step]).reshape(-1, 6))
+        )
         return np.sqrt(np.maximum(squared_errors(graph, moved), 1e-300))
 
     best = scipy.optimize.least_squares(cost, np.zeros(24), xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -73,7 +75,8 @@ def test_masked_edges_and_lonely_nodes_change_nothing(seed):
         np.concatenate([graph.information, np.eye(6)[None]]), np.append(graph.mask, False),
     )  # fmt: skip
     lonely = RigidTransform(
-        np.concatenate([start.rotation, np.eye(3)[None]]), np.append(start.translation, [[7, 8, 9]], 0)
+        np.concatenate([start.rotation, np.eye(3)[None]]),
+        np.append(start.translation, [[7, 8, 9]], 0),
     )
     with np.errstate(invalid="ignore"):
         again = solve_poses(more, lonely)
@@ -123,7 +126,11 @@ def test_a_public_graph_has_gtsam_s_solution(name):
     start = RigidTransform(matrices[:, :3, :3], matrices[:, :3, 3])
     transform = RigidTransform(edges.transform[:, :3, :3], edges.transform[:, :3, 3])
     graph = PoseGraph(
-        edges.source, edges.reference, transform, edges.information, np.ones(len(edges.source), bool)
+        edges.source,
+        edges.reference,
+        transform,
+        edges.information,
+        np.ones(len(edges.source), bool),
     )
     found = solve_poses(graph, start, tolerance=1e-15)
     theirs = np.array([expected.atPose3(k).matrix() for k in range(len(matrices))])
