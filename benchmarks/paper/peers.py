@@ -25,12 +25,12 @@ COLUMNS = {
 }
 CEMNET = "cemnet:{folder}/cemnet_modelnet40_n768_unseen0_noise{noise}.npz"
 METHODS = {
-    "cemnet": ("CEMNet", "its authors' weights"),
-    "dcp": ("DCP v1", "its authors' weights"),
-    "rienet": ("RIENet", "its authors' weights"),
-    "idam": ("IDAM", "not trained here"),
-    "rpmnet": ("RPM-Net", "not trained here"),
-    "fmr": ("FMR", "not built here"),
+    "cemnet": "CEMNet, its authors' weights",
+    "dcp": "DCP v1, its authors' weights",
+    "rienet": "RIENet, its authors' weights",
+    "idam": "IDAM, not trained here",
+    "rpmnet": "RPM-Net, not trained here",
+    "fmr": "FMR, not built here",
 }
 PUBLISHED = {"idam": 0.4243, "rpmnet": 0.0051, "fmr": 3.6497, "cemnet": 0.1385, "rienet": 0.0033}
 """MAE(R) of the paper's Table 1 on unseen objects, over all pairs, in degrees."""
@@ -74,7 +74,6 @@ def measure(method: str, column: str, options: Options, root: Path | None) -> di
         f"{column}_median": found["median_rre_deg"],
         f"{column}_recall": found["recall_5deg"],
         f"{column}_worst": found["worst_rre_deg"],
-        f"{column}_ms": 1e3 * found["seconds_per_pair"],
     }
     print(method, {key: float(f"{value:.3g}") for key, value in cell.items()}, flush=True)
     return cell
@@ -88,13 +87,12 @@ def write(rows: dict[str, dict], options: Options) -> Path:
         "median": "median",
         "recall": "recall 5 deg",
         "worst": "worst",
-        "ms": "ms a pair",
     }
     return record.write(
         "peers",
         question="What do the learned methods of the paper's table reach here?",
         command=record.command("benchmarks.paper.peers"),
-        columns={"weights": "weights", "paper": "unseen objects: paper's MAE(R)"}
+        columns={"paper": "unseen objects: paper's MAE(R)"}
         | {
             f"{column}_{key}": f"{COLUMNS[column][1]}: {head}"
             for column in options.only
@@ -110,8 +108,8 @@ def main(options: Options) -> None:
     enable_compilation_cache()
     root = data_root(options.data_root, CONFIGS / "any.toml")
     rows = {
-        method: {"label": label, "weights": weights, "paper": PUBLISHED.get(method)}
-        for method, (label, weights) in METHODS.items()
+        method: {"label": label, "paper": PUBLISHED.get(method)}
+        for method, label in METHODS.items()
     }
     for column in options.only:
         for method in METHODS:

@@ -10,7 +10,7 @@ a symmetric shape scores as well as the right one.
 """
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -91,15 +91,15 @@ def register(
         cloud has fewer than `config.k` points; `config` is not that of CEMNet.
     """
     config = pair.settings(config, "cemnet", CEMNetConfig)
-    source, reference = pair.clouds(source, reference, source_mask, reference_mask)
-    variables = pair.in_dtype(variables, source.points.dtype)
-    prior = sampling_network(variables, source, reference, config=config)
-    found = _cross_entropy_method(_explored(prior, config.exploration), source, reference, config)
+    moving, fixed = pair.clouds(source, reference, source_mask, reference_mask)
+    variables = pair.in_dtype(variables, moving.points.dtype)
+    prior = sampling_network(variables, moving, fixed, config=config)
+    found = _cross_entropy_method(_explored(prior, config.exploration), moving, fixed, config)
     transform = pose_of(found.mu)
-    moved = rigid.apply(transform, source.points)
-    nearest = reference.points[nearest_in(moved, reference.points, reference.mask)]
+    moved = rigid.apply(transform, moving.points)
+    nearest = fixed.points[nearest_in(moved, fixed.points, fixed.mask)]
     agreement = jnp.maximum(1 - safe_norm(moved - nearest) / config.epsilon, 0)
-    return pair.registration(transform, source, reference, agreement)
+    return pair.registration(transform, moving, fixed, agreement)
 
 
 def init_variables(key: PRNGKeyArray, config: CEMNetConfig) -> Variables:
@@ -128,7 +128,7 @@ def sampling_network(
         networks[0].apply(own[0], pair.absolute_edges(cloud, config.k), cloud.mask, train=False)
         for cloud in (source, reference)
     ]
-    scores = pair.row_softmax(-feature_distance(*features), reference.mask)
+    scores = pair.row_softmax(-feature_distance(features[0], features[1]), reference.mask)
     copy = jnp.matmul(scores, reference.points, precision=Precision.HIGHEST)
     weights = jnp.asarray(source.mask & jnp.any(reference.mask), copy.dtype)
     transform = weighted_procrustes(source.points, copy, weights)
@@ -141,7 +141,7 @@ def sampling_network(
     return Distribution(numbers_of(transform), sigma)
 
 
-def _networks(config: CEMNetConfig) -> tuple[DGCNN, _SamplingNetwork]:
+def _networks(config: CEMNetConfig) -> tuple[Any, Any]:
     return DGCNN(config.channels, config.width, _BN_MOMENTUM), _SamplingNetwork(config.hidden)
 
 
@@ -154,14 +154,14 @@ def numbers_of(transform: RigidTransform) -> Float[Array, "6"]:
     flat = safe_norm(r[0, :2])
     locked = flat <= _LOCKED * jnp.finfo(r.dtype).eps
 
-    def angle(sine, cosine, kept=True):
+    def angle(sine, cosine, kept):
         usable = kept & ((sine != 0) | (cosine != 0))
         sine, cosine = jnp.where(usable, sine, 0), jnp.where(usable, cosine, 1)
         return jnp.arctan2(sine, cosine)
 
     about_z = angle(-r[0, 1], r[0, 0], ~locked)
     about_x = angle(-r[1, 2], r[2, 2], ~locked) + angle(r[1, 0] * r[0, 2], r[1, 1], locked)
-    about_y = angle(r[0, 2], flat)
+    about_y = angle(r[0, 2], flat, True)
     return jnp.concatenate([jnp.stack([about_z, about_y, about_x]), transform.translation])
 
 

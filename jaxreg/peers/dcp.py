@@ -5,6 +5,7 @@ needs full overlap, and the authors' weights know clouds of the same points only
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 from jax.lax import Precision
@@ -43,13 +44,13 @@ def register(
         cloud has fewer than `config.k` points; `config` is not that of DCP.
     """
     config = pair.settings(config, "dcp", DCPConfig)
-    source, reference = pair.clouds(source, reference, source_mask, reference_mask)
-    variables = pair.in_dtype(variables, source.points.dtype)
-    embeddings = [embedding(variables, cloud, config=config) for cloud in (source, reference)]
-    copy = soft_pointer(*embeddings, reference)
-    weights = jnp.asarray(source.mask & jnp.any(reference.mask), copy.dtype)
-    transform = weighted_procrustes(source.points, copy, weights)
-    return pair.registration(transform, source, reference, jnp.ones_like(weights), copy)
+    moving, fixed = pair.clouds(source, reference, source_mask, reference_mask)
+    variables = pair.in_dtype(variables, moving.points.dtype)
+    embeddings = [embedding(variables, cloud, config=config) for cloud in (moving, fixed)]
+    copy = soft_pointer(embeddings[0], embeddings[1], fixed)
+    weights = jnp.asarray(moving.mask & jnp.any(fixed.mask), copy.dtype)
+    transform = weighted_procrustes(moving.points, copy, weights)
+    return pair.registration(transform, moving, fixed, jnp.ones_like(weights), copy)
 
 
 def init_variables(key: PRNGKeyArray, config: DCPConfig) -> Variables:
@@ -81,7 +82,7 @@ def soft_pointer(
     return jnp.matmul(scores, cloud.points, precision=Precision.HIGHEST)
 
 
-def _network(config: DCPConfig) -> DGCNN:
+def _network(config: DCPConfig) -> Any:
     return DGCNN(config.channels, config.width, _BN_MOMENTUM)
 
 

@@ -143,7 +143,7 @@ def register(
     config = pair.settings(config, "idam", IDAMConfig)
     clouds = pair.clouds(source, reference, source_mask, reference_mask)
     variables = pair.in_dtype(variables, clouds[0].points.dtype)
-    kept = []
+    kept: list[Kept] = []
     for cloud in clouds:
         features, significance, variables = _described(variables, cloud, config, train=False)
         rows, mask = hard_elimination(significance, cloud.mask, one_in=config.kept_one_in)
@@ -294,7 +294,8 @@ def loss(
         total = jnp.sum(jnp.where(mask, values, 0))
         return total / jnp.maximum(jnp.sum(mask, dtype=values.dtype), 1)
 
-    matching, validity = 0.0, 0.0
+    zero = jnp.zeros((), source.points.dtype)
+    matching, validity, significance = zero, zero, zero
     for step in steps:
         logs = _log_softmax(step.scores, valid, axis=1)
         matching += mean(-jnp.diagonal(logs), partner[rows])
@@ -302,7 +303,6 @@ def loss(
         right = safe_norm(target[rows] - found) < config.match_distance
         chance = jnp.clip(step.validity, 1e-6, 1 - 1e-6)
         validity += mean(-jnp.log(jnp.where(right, chance, 1 - chance)), valid)
-    significance = 0.0
     for axis, chosen, (_, given) in zip((1, 0), (rows, nearest[rows]), described, strict=True):
         logs = jax.lax.stop_gradient(_log_softmax(steps[0].scores, valid, axis=axis))
         entropy = jnp.sum(jnp.exp(logs) * logs, axis=axis)

@@ -1,6 +1,6 @@
 """What every peer does with a pair: check it on the way in, make its record on the way out."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,10 @@ from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, nearest_in, without_padding
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
+_Settings = TypeVar("_Settings")
 
-def settings(config: Any, section: str, kind: type) -> Any:
+
+def settings(config: Any, section: str, kind: type[_Settings]) -> _Settings:
     """The settings of one peer: `config` itself, or its section of a whole configuration.
 
     Raises:
@@ -23,7 +25,9 @@ def settings(config: Any, section: str, kind: type) -> Any:
     return found
 
 
-def clouds(source: Any, reference: Any, source_mask: Any, reference_mask: Any):
+def clouds(
+    source: Any, reference: Any, source_mask: Any, reference_mask: Any
+) -> tuple[PointCloud, PointCloud]:
     """Both clouds with their padding at zero; one with a point that is not finite counts as empty.
 
     Raises:
@@ -34,10 +38,11 @@ def clouds(source: Any, reference: Any, source_mask: Any, reference_mask: Any):
         arguments.usable("source_mask", source, source_mask),
         arguments.usable("reference_mask", reference, reference_mask),
     )
-    return tuple(
+    first, second = (
         PointCloud(without_padding(points, mask), mask)
         for points, mask in zip((source, reference), masks, strict=True)
     )
+    return first, second
 
 
 def in_dtype(variables: Any, dtype: Any) -> Any:

@@ -10,7 +10,7 @@ the sign may differ between two clouds, and with it three of the ten channels of
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -170,7 +170,7 @@ def init_variables(key: PRNGKeyArray, config: RPMNetConfig) -> Variables:
     return {"params": {"parameters": first, "features": second}, "batch_stats": {}}
 
 
-def _networks(config: RPMNetConfig) -> tuple[_ParameterNetwork, _FeatureNetwork]:
+def _networks(config: RPMNetConfig) -> tuple[Any, Any]:
     return _ParameterNetwork(config.hidden), _FeatureNetwork(config.width)
 
 
