@@ -92,9 +92,7 @@ def gtsam_s(graph: PoseGraph, start: RigidTransform) -> tuple[RigidTransform, np
     for k in range(count):
         initial.insert(k, gtsam.Pose3(gtsam.Rot3(start.rotation[k]), start.translation[k]))
     for k in range(len(graph.source)):
-        pose = gtsam.Pose3(
-            gtsam.Rot3(graph.transform.rotation[k]), graph.transform.translation[k]
-        )
+        pose = gtsam.Pose3(gtsam.Rot3(graph.transform.rotation[k]), graph.transform.translation[k])
         ends = int(graph.reference[k]), int(graph.source[k])
         factors.add(gtsam.BetweenFactorPose3(*ends, pose, noise))
     first = initial.atPose3(0)

@@ -11,6 +11,7 @@ HOST = {
     "weights.released.available_weights",
     "weights.released.load_pretrained",
 }
+HOST |= {"scans.many.register_many", "graph.sparse.solve_poses"}
 HOST |= {"scans.pair.register", "refine.config.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 HOST |= {"refine.gicp.generalized", "refine.methods.method_of"}
@@ -29,8 +30,13 @@ HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
-ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
-"""Transformed in their own tests: test_batching.py, data/test_pairs.py and test_training.py."""
+ELSEWHERE = {
+    "graph.optimize.optimize_poses",
+    "batching.map_pairs",
+    "data.pairs.make_pair",
+    "training.batch_loss",
+}
+"""Transformed in their own tests: graph/test_optimize.py, test_batching.py, data/test_pairs.py and test_training.py."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
