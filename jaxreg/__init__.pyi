@@ -38,6 +38,11 @@ from .refine.uncertainty import (
 )
 from .types import Refinement as Refinement
 
+# Pose graphs
+from .graph.optimize import OptimizedPoses as OptimizedPoses, optimize_poses as optimize_poses
+from .graph.pose_graph import PoseGraph as PoseGraph
+from .graph.sparse import SolvedPoses as SolvedPoses, solve_poses as solve_poses
+
 # Registration without a start
 from .search.config import SearchConfig as SearchConfig
 from .search.learned import load_features as load_features
@@ -72,7 +77,7 @@ from .config import (
 )
 from . import peers as peers
 
-# Two scans, on the host
+# Scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud
 from .scans.config import RegisterConfig as RegisterConfig
 from .scans.pair import register as register
@@ -82,6 +87,7 @@ from .scans.result import (
     FewEvidence as FewEvidence,
     ScanRegistration as ScanRegistration,
 )
+from .scans.many import Alignment as Alignment, register_many as register_many
 from .view.page import write_page as write_page, write_registration_page as write_registration_page
 from .view.pictures import plot_pair as plot_pair
 

@@ -130,7 +130,7 @@ def _check(command: Align) -> None:
 def _write(command: Align, scans: list["Scan"], alignment: "Alignment") -> list[Path]:
     """Write what is asked for; returns the paths."""
     from jaxreg import io
-    from jaxreg.scans import summary
+    from jaxreg.scans import alignment_summary as summary
     from jaxreg.view import alignment_page
 
     clouds = [scan.points for scan in scans]
@@ -140,7 +140,7 @@ def _write(command: Align, scans: list["Scan"], alignment: "Alignment") -> list[
         (command.poses, lambda path: io.write_poses(
             path, alignment.transformation, names=names, edges=summary.edges(alignment))),
         (command.json, lambda path: path.write_text(
-            json.dumps(summary.alignment_record(alignment, names), indent=1, allow_nan=False) + "\n",
+            json.dumps(summary.record(alignment, names), indent=1, allow_nan=False) + "\n",
             "utf-8")),
         (command.html, lambda path: alignment_page.write_alignment_page(
             path, clouds, alignment, names=names)),
@@ -177,11 +177,11 @@ def _write_merged(command: Align, clouds: list[np.ndarray], alignment: "Alignmen
 
 
 def _print(command: Align, scans: list["Scan"], alignment: "Alignment", seconds: float) -> None:
-    from jaxreg.scans import summary
+    from jaxreg.scans import alignment_summary as summary
 
     points = sum(len(scan.points) for scan in scans)
     line("scans", f"{len(scans)} ({points:,} points)")
-    for name, value in summary.alignment_figures(alignment).items():
+    for name, value in summary.figures(alignment).items():
         line(name, value)
     line("time", f"{seconds:.2f} s")
     for k, group in enumerate(alignment.groups):
@@ -193,7 +193,7 @@ def _print(command: Align, scans: list["Scan"], alignment: "Alignment", seconds:
         line("not placed", f"{command.scans[k]}: {alignment.reasons[k]}")
     if len(alignment.unplaced) > _LISTED:
         line("not placed", f"and {len(alignment.unplaced) - _LISTED} more: see --json")
-    line("verdict", summary.alignment_verdict(alignment))
+    line("verdict", summary.verdict(alignment))
     if not alignment.success:
         say(
             f"{'hint':<16} look at it with --html PAGE.html; poses to start from help: --initial FILE"

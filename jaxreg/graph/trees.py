@@ -96,7 +96,7 @@ def triangles(
 def triangle_errors(graph: PoseGraph, found: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "t"]:
     """For every triangle ``e^T S^-1 e`` of the way around it, S the sum of the covariances.
 
-    With nodes i < j < k and the measured ``A`` (j to i), ``B`` (k to j) and ``C`` (k to i), ``e`` is the
+    With nodes i < j < k, ``A`` from j to i, ``B`` from k to j and ``C`` from k to i, ``e`` is the
     logarithm of ``C^-1 A B``. Of right edges chi squared with 6 degrees.
     """
     if len(found) == 0:

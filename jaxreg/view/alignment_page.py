@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.scans import summary
+from jaxreg.scans import alignment_summary as summary
 from jaxreg.scans.many import Alignment
 from jaxreg.view import page
 
@@ -42,7 +42,7 @@ def write_alignment_page(
         "motions": [],
         "edges": _lines(alignment, shown, origin),
         "figures": _figures(alignment, names),
-        "verdict": {"text": summary.alignment_verdict(alignment), "good": alignment.success},
+        "verdict": {"text": summary.verdict(alignment), "good": alignment.success},
     }
     page.write_content(path, f"{len(clouds)} scans", content)
 
@@ -63,7 +63,7 @@ def draw_alignment(
         shown,
         [colour(k) for k in members],
         path,
-        title=summary.alignment_verdict(alignment),
+        title=summary.verdict(alignment),
         labels=[Path(names[k]).name for k in members],
     )
 
@@ -98,7 +98,7 @@ def _lines(alignment: Alignment, shown: dict[int, np.ndarray], origin: np.ndarra
 
 
 def _figures(alignment: Alignment, names: Sequence[str]) -> list[list[str]]:
-    figures = [[name, value] for name, value in summary.alignment_figures(alignment).items()]
+    figures = [[name, value] for name, value in summary.figures(alignment).items()]
     short = [Path(name).name for name in names]
     for number, group in enumerate(alignment.groups):
         figures.append([f"group {number + 1}", "\n".join(

@@ -11,6 +11,7 @@ HOST = {
     "weights.released.available_weights",
     "weights.released.load_pretrained",
 }
+HOST |= {"scans.many.register_many", "graph.sparse.solve_poses"}
 HOST |= {"scans.pair.register", "refine.config.check_options"}
 HOST |= {"refine.uncertainty.weak_directions", "refine.uncertainty.about"}
 HOST |= {"refine.gicp.generalized", "refine.methods.method_of"}
@@ -32,8 +33,9 @@ HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
 HOST |= {"network.batch.register_batch", "exported.export_program", "exported.load_exported"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
-ELSEWHERE |= {"peers.idam.loss", "peers.rpmnet.loss"}
-"""Transformed in their own tests: test_batching.py, data/test_pairs.py, test_training.py and peers/."""
+ELSEWHERE |= {"graph.optimize.optimize_poses", "peers.idam.loss", "peers.rpmnet.loss"}
+"""Transformed in their own tests: graph/test_optimize.py, test_batching.py, data/test_pairs.py,
+test_training.py and peers/."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
