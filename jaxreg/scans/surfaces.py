@@ -298,6 +298,9 @@ def finished(problem: Problem, found: Found) -> ScanRegistration:
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
     )
     judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
+    cause = cause or verdict.in_a_volume(
+        judged, source.fine.examined, problem.reference.fine.examined
+    )
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
     chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
     success = verdict.is_success(chance, chances[1:], refined.converged)
