@@ -1,16 +1,18 @@
 """Every picture of the documentation, from procedural shapes and the released weights.
 
-    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos search]
+    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos search reliability]
     python -m benchmarks.figures --only drift --runs runs/drift_default runs/drift_batch4 ...
 
 `pairs` and `noise`: pairs before and after, with the inlier confidence as colour. `matches`: the
 best match of points at the first step with the 1-NN cloud, with every point in the place of its own
 1-NN, and with a single neighbourhood, all with the same weights. `arccos`: the published form of
-MIE(R) beside the true angle. `search`: the stages of the search. `drift`: validation errors of runs of
+MIE(R) beside the true angle. `search`: the stages of the search. `reliability`: how often poses of a
+given probability are right, as benchmarks/results/reliability.json says. `drift`: validation errors of runs of
 train.py.
 """
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +27,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
+from benchmarks import record
 from benchmarks.search_figure import draw_search
 from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import ModelConfig, PairConfig
@@ -53,7 +56,7 @@ class Options:
     """Which pictures, and where to."""
 
     folder: str = "docs/images"
-    only: tuple[str, ...] = ("pairs", "noise", "matches", "arccos", "search")
+    only: tuple[str, ...] = ("pairs", "noise", "matches", "arccos", "search", "reliability")
     weights: str = "modelnet40"
     seed: int = 0
     runs: tuple[str, ...] = ()
@@ -237,6 +240,34 @@ def draw_drift(options: Options, path: Path) -> None:
     figure.savefig(path, dpi=90, facecolor="white")
 
 
+def draw_reliability(path: Path) -> None:
+    """Share of right poses over their probability, a point a bin, its area by the pairs in it."""
+    found = json.loads((record.FOLDER / "reliability.json").read_text("utf-8"))
+    rows = [row for row in found["rows"].values() if row["pairs"]]
+    chance, right, pairs = (
+        np.array([row[key] for row in rows]) for key in ("probability", "right", "pairs")
+    )
+    deviation = np.sqrt(np.maximum(chance * (1 - chance), 1e-4) / pairs)
+    figure = Figure(figsize=(5.6, 5.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="black", lw=0.8, label="what was promised")
+    axes.errorbar(chance, right, deviation, fmt="none", color="0.6", lw=1, label="one deviation")
+    axes.scatter(chance, right, s=8 + 2 * pairs, color=pictures.SOURCE, alpha=0.8, zorder=3)
+    for x, y, count in zip(chance, right, pairs, strict=True):
+        axes.annotate(f"{count}", (x, y), (0, 11), textcoords="offset points", ha="center", size=8)
+    axes.set(
+        xlim=(-0.05, 1.05),
+        ylim=(-0.05, 1.1),
+        aspect="equal",
+        xlabel="probability given by jaxreg.register",
+        ylabel="share of these poses that are right",
+        title=f"{found['setting']['pairs']} pairs of real scans (number of pairs at each point)",
+    )
+    axes.title.set_size(10)
+    axes.legend(frameon=False, loc="upper left")
+    figure.savefig(path, dpi=90, facecolor="white")
+
+
 def draw(name: str, options: Options) -> None:
     path = Path(options.folder) / f"{name}.png"
     if name == "pairs":
@@ -252,6 +283,8 @@ def draw(name: str, options: Options) -> None:
         draw_pairs(register(pairs, options.weights, robust), labels, path, title)
     elif name == "search":
         draw_search(path)
+    elif name == "reliability":
+        draw_reliability(path)
     else:
         {"matches": draw_matches, "arccos": draw_arccos, "drift": draw_drift}[name](options, path)
     print(path, flush=True)

@@ -46,6 +46,7 @@ from .types import GlobalRegistration as GlobalRegistration
 
 # The paper's network
 from .config import LossConfig as LossConfig, ModelConfig as ModelConfig
+from .network.batch import register_batch as register_batch
 from .network.model import init_variables as init_variables, register_pair as register_pair
 from .peers.rienet import load_rienet as load_rienet
 from .types import Registration as Registration
@@ -54,6 +55,22 @@ from .weights.released import (
     available_weights as available_weights,
     load_pretrained as load_pretrained,
 )
+
+# Programs in files
+from .exported import (
+    ExportedProgram as ExportedProgram,
+    export_program as export_program,
+    load_exported as load_exported,
+)
+
+# Other learned methods
+from .config import (
+    CEMNetConfig as CEMNetConfig,
+    DCPConfig as DCPConfig,
+    IDAMConfig as IDAMConfig,
+    RPMNetConfig as RPMNetConfig,
+)
+from . import peers as peers
 
 # Two scans, on the host
 from .io import read_cloud as read_cloud, write_cloud as write_cloud

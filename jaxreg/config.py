@@ -64,6 +64,95 @@ class ModelConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DCPConfig:
+    """DCP v1 (Wang and Solomon, 2019); the sizes are those of its released weights."""
+
+    k: int = 20
+    """Neighbours of a point in its graph; the point itself is the first."""
+    channels: tuple[int, ...] = (64, 64, 128, 256)
+    """Widths of the DGCNN layers."""
+    width: int = 512
+    """Width of the embedding."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CEMNetConfig:
+    """CEMNet (Jiang et al., 2021); the sizes are those of its released weights."""
+
+    k: int = 20
+    """Neighbours of a point in its graph; the point itself is the first."""
+    channels: tuple[int, ...] = (64, 64, 128, 256)
+    """Widths of the DGCNN layers."""
+    width: int = 512
+    """Width of the embedding."""
+    hidden: tuple[int, ...] = (128, 64)
+    """Widths of the layers that predict sigma."""
+    iterations: int = 10
+    """Rounds of the cross-entropy method."""
+    candidates: int = 1000
+    """Poses drawn in a round."""
+    look_ahead: int = 3
+    """First rounds, whose errors also count what three steps of ICP make of a pose."""
+    future: float = 0.5
+    """Share of that in these errors."""
+    exploration: float = 0.5
+    """How far the predicted distribution is mixed with a wide one about no motion at all."""
+    epsilon: float = 0.1
+    """Distance at which a point no longer agrees (in the unit of the clouds)."""
+    stride: int = 6
+    """In the rounds that look ahead every so many points are scored; afterwards all are."""
+    reach: int = 16
+    """Points of the other cloud that are looked at in the later rounds: those nearest to a point at
+    the mean pose."""
+    seed: int = 0
+    """Seed of the poses that are drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class IDAMConfig:
+    """IDAM (Li et al., 2020), with the features of its graph network."""
+
+    k: int = 12
+    """Neighbours of a point in its graph; the point itself is the first."""
+    channels: tuple[int, ...] = (64, 64, 64, 64, 64)
+    """Widths of the layers of the graph network; the last is that of the features."""
+    hidden: int = 32
+    """Width of the similarity and weight networks."""
+    kept_one_in: int = 6
+    """Hard elimination keeps one point in so many of the source."""
+    iterations: int = 3
+    """Registration steps; each has its own similarity and weight networks."""
+    match_distance: float = 0.05
+    """In training two points closer than this at the true pose correspond."""
+    bn_momentum: float = 0.9
+    """Share of the old running statistics that BatchNorm keeps at a training step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RPMNetConfig:
+    """RPM-Net (Yew and Lee, 2020)."""
+
+    radius: float = 0.3
+    """Radius of a neighbourhood, in the unit of the clouds."""
+    neighbors: int = 64
+    """Points of a neighbourhood: the first so many of the cloud within the radius."""
+    width: int = 96
+    """Width of the features; a multiple of 16."""
+    hidden: tuple[int, ...] = (64, 64, 64, 128, 1024, 512, 256)
+    """Widths of the network that predicts alpha and beta: all but the last two before its pooling."""
+    k_normals: int = 16
+    """Neighbours of the plane that gives a point its normal."""
+    sinkhorn: int = 5
+    """Normalisations of rows and columns."""
+    iterations: int = 5
+    """Registration steps."""
+    train_iterations: int = 2
+    """Registration steps in training."""
+    inliers: float = 0.01
+    """Weight of the loss on points without a partner."""
+
+
+@dataclasses.dataclass(frozen=True)
 class LossConfig:
     """The four losses of Eq. 14-18, summed over points, averaged over pairs."""
 
@@ -195,8 +284,18 @@ class Config:
     differs."""
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
+    network: Literal["paper", "dcp", "cemnet", "idam", "rpmnet"] = "paper"
+    """The method: the paper's, set up by `model`, or another one, set up by the section of its name."""
+    dcp: DCPConfig = DCPConfig()
+    cemnet: CEMNetConfig = CEMNetConfig()
+    idam: IDAMConfig = IDAMConfig()
+    rpmnet: RPMNetConfig = RPMNetConfig()
     weights: str = ""
     """Released weights that `jaxreg evaluate` uses when no checkpoint is given."""
+
+
+PEERS = ("dcp", "cemnet", "idam", "rpmnet")
+"""Networks other than the paper's; each has a section of its name."""
 
 
 def available_configs() -> tuple[str, ...]:
@@ -291,13 +390,21 @@ _LEAST = {
     "model": dict.fromkeys(
         ("k", "k_matching", "channels", "width", "inlier_width", "n_inliers", "iterations"), 1
     ),
+    "dcp": dict.fromkeys(("k", "channels", "width"), 1),
+    "cemnet": dict.fromkeys(
+        ("k", "channels", "width", "hidden", "candidates", "iterations", "stride", "reach"), 1
+    ),
+    "idam": dict.fromkeys(("k", "channels", "hidden", "kept_one_in", "iterations"), 1),
+    "rpmnet": dict.fromkeys(
+        ("neighbors", "width", "hidden", "k_normals", "iterations", "train_iterations"), 1
+    ),
     "pairs": {"points": 1, "kept": 1},
     "data": dict.fromkeys(("train_shapes", "test_shapes", "train_draws", "test_draws"), 1),
     "train": {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1},
 }
 """The smallest allowed value of these settings; other numbers must not be negative."""
-_POSITIVE = ("learning_rate", "clip", "beta")
-_SHARES = ("bn_momentum", "ema", "test_share", "validation_share")
+_POSITIVE = ("learning_rate", "clip", "beta", "epsilon", "radius", "match_distance")
+_SHARES = ("bn_momentum", "ema", "exploration", "future", "test_share", "validation_share")
 _LIMITS = {"clip": math.inf, "rotation_max_deg": 360.0} | dict.fromkeys(_SHARES, 1.0)
 
 

@@ -63,6 +63,38 @@ def counting_progress(
     console.print(text, highlight=False, soft_wrap=True)
 
 
+@contextlib.contextmanager
+def stage_progress(*, console: Console | None = None) -> Iterator[Callable[[int, int, str], None]]:
+    """Shows how many of the wanted are done, and what is being done; both may grow meanwhile.
+
+    A bar on a terminal; elsewhere a line when what is being done changes, and one every 20 seconds.
+    """
+    console = console or Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        yield _stage_lines(console)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda done, wanted, text: progress.update(
+            task, completed=done, total=wanted or None, description=text
+        )
+
+
+def _stage_lines(console: Console) -> Callable[[int, int, str], None]:
+    last, stage = float("-inf"), ""
+
+    def show(done: int, wanted: int, text: str) -> None:
+        nonlocal last, stage
+        now, kind = time.monotonic(), text.split()[0]
+        if kind != stage or now - last >= _SECONDS_BETWEEN_LINES:
+            last, stage = now, kind
+            count = f" ({done} of {wanted})" if wanted else ""
+            console.print(f"{text}{count}", highlight=False, soft_wrap=True, markup=False)
+
+    return show
+
+
 def _display(
     total: int, unit: str, text: str, console: Console
 ) -> contextlib.AbstractContextManager[Show]:

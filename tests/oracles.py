@@ -106,26 +106,27 @@ def batch_norm(params, statistics, name, x):
 
 def dgcnn(params, statistics, points, neighbors):
     """Features of a cloud, point by point and edge by edge."""
+    edges = [[points[j] - points[i] for j in near] for i, near in enumerate(neighbors)]
+    return np.array([dgcnn_of_edges(params, statistics, x) for x in edges])
+
+
+def dgcnn_of_edges(params, statistics, x):
+    """The feature of a point from its edges."""
     layers = sum(name.startswith("Dense") for name in params)
-    features = []
-    for i, near in enumerate(neighbors):
-        x = [points[j] - points[i] for j in near]
-        pooled = []
-        for layer in range(layers - 1):
-            x = [
-                np.maximum(
-                    batch_norm(
-                        params, statistics, f"BatchNorm_{layer}", dense(params[f"Dense_{layer}"], e)
-                    ),
-                    0,
-                )
-                for e in x
-            ]
-            pooled.append(np.max(x, axis=0))
-        last = dense(params[f"Dense_{layers - 1}"], np.concatenate(pooled))
-        normal = batch_norm(params, statistics, f"BatchNorm_{layers - 1}", last)
-        features.append(np.maximum(normal, 0))
-    return np.array(features)
+    pooled = []
+    for layer in range(layers - 1):
+        x = [
+            np.maximum(
+                batch_norm(
+                    params, statistics, f"BatchNorm_{layer}", dense(params[f"Dense_{layer}"], e)
+                ),
+                0,
+            )
+            for e in x
+        ]
+        pooled.append(np.max(x, axis=0))
+    last = dense(params[f"Dense_{layers - 1}"], np.concatenate(pooled))
+    return np.maximum(batch_norm(params, statistics, f"BatchNorm_{layers - 1}", last), 0)
 
 
 def inlier_confidence(params, statistics, source, copy):

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
 PAGES = {name: path for name, path in DOCS.items() if BLOCK.search(path.read_text("utf-8"))}
 # What these need is compiled by no other test; the other pages run in every suite.
-SLOW = ("read-the-results", "use-it-inside-your-jax-code")
+SLOW = ("read-the-results", "register-two-scans", "use-it-inside-your-jax-code")
 NOTEBOOKS = {path.stem: path for path in sorted((ROOT / "examples").glob("*.ipynb"))}
 
 
@@ -80,6 +80,7 @@ def test_training_on_a_folder_runs_as_its_guide_says(folder):
     assert forms(shown) <= forms("".join(outputs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_print_what_they_show(folder, name, monkeypatch):
     display = types.SimpleNamespace(Image=lambda path, width: Path(path).read_bytes())

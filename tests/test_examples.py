@@ -24,6 +24,7 @@ def test_calibrate_sensor_learns_the_offset_through_registration(capsys):
     assert f"step {example['STEPS']}: offset" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_implicit_gradient_is_that_of_the_iterations(capsys):
     example = runpy.run_path(str(EXAMPLES / "implicit_gradient.py"))
@@ -32,6 +33,7 @@ def test_implicit_gradient_is_that_of_the_iterations(capsys):
     assert "implicit" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.loose
 @pytest.mark.parametrize("x64", [False, True])

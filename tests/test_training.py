@@ -58,6 +58,7 @@ def gradient_of(config: Config):
     return jax.jit(jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True))
 
 
+@pytest.mark.slow
 def test_the_true_transform_changes_no_gradient(config, seed):
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
     pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
@@ -105,6 +106,7 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     assert after < before
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_an_unbroken_one(config, tmp_path, monkeypatch):
     unbroken = training.train(config, tmp_path / "unbroken")
 

@@ -26,6 +26,8 @@ from jaxreg.data.seven_scenes import read_fragment
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.types import RigidTransform
 
+BINS = 10
+"""Of equal width, in the calibration error and the reliability diagram."""
 LOW = 0.3
 """Pairs that overlap by less than this are reported apart."""
 RIGHT = {
@@ -147,7 +149,7 @@ class Options:
     data_root: str | None = None
     sensors: tuple[str, ...] = tuple(RIGHT)
     record: bool = True
-    """Write benchmarks/results/sensors.json."""
+    """Write benchmarks/results/sensors.json and reliability.json."""
 
 
 def measure(root: Path, sensor: str) -> Iterator[dict]:
@@ -181,8 +183,32 @@ def summary(entries: list[dict]) -> dict:
         "listed": int(sum(e["listed"] for e in entries)),
         "believed": int(np.sum(right & success)),
         "wrong": int(np.sum(~right & success)),
+        "calibration": calibration_error(entries),
         "seconds": float(np.median([e["seconds"] for e in entries])),
     }
+
+
+def calibration_error(entries: list[dict]) -> float:
+    """Expected calibration error: sum over bins of n_b / n |mean probability - share right|."""
+    rows = reliability(entries).values()
+    apart = [row["pairs"] * abs(row["probability"] - row["right"]) for row in rows if row["pairs"]]
+    return sum(apart) / len(entries)
+
+
+def reliability(entries: list[dict]) -> dict[str, dict]:
+    """In bins of equal width: how probable the poses were said to be, and how many are right."""
+    chance = np.array([e["probability"] for e in entries])
+    right = np.array([e["right"] for e in entries], float)
+    bins = np.minimum((chance * BINS).astype(int), BINS - 1)
+    rows = {}
+    for number in range(BINS):
+        inside = bins == number
+        found = {"probability": None, "right": None}
+        if inside.any():
+            found = {"probability": chance[inside].mean(), "right": right[inside].mean()}
+        label = f"{number / BINS:.1f} to {(number + 1) / BINS:.1f}"
+        rows[f"bin{number}"] = {"label": label, "pairs": int(inside.sum())} | found
+    return rows
 
 
 COLUMNS = {
@@ -191,6 +217,7 @@ COLUMNS = {
     "listed": "right, or among the alternatives",
     "believed": "right and called a success",
     "wrong": "wrong and called a success",
+    "calibration": "calibration error",
     "seconds": "median s",
 }
 
@@ -201,20 +228,30 @@ def main(options: Options) -> None:
     if root is None:
         raise SystemExit("no data: set $JAXREG_DATA or give --data-root.")
     process.enable_compilation_cache()
-    rows = {}
+    rows, everything = {}, []
     for sensor in options.sensors:
         entries = list(measure(root, sensor))
+        everything += entries
         for key, label, low in (("low", "overlap below .3", True), ("high", ".3 and more", False)):
             if group := [e for e in entries if e["low"] is low]:
                 rows[f"{sensor}_{key}"] = {"label": f"{sensor}, {label}"} | summary(group)
                 print(rows[f"{sensor}_{key}"], flush=True)
     if options.record:
+        command = record.command("benchmarks.scans.sensors")
         record.write(
             "sensors",
             question="How many pairs of real scans of other sensors are registered?",
-            command=record.command("benchmarks.scans.sensors"),
+            command=command,
             columns=COLUMNS,
             rows=rows,
+        )
+        record.write(
+            "reliability",
+            question="How often is a pose of a given probability right, on real scans?",
+            command=command,
+            columns={"pairs": "pairs", "probability": "mean probability", "right": "share right"},
+            rows=reliability(everything),
+            setting={"calibration": calibration_error(everything), "pairs": len(everything)},
         )
 
 

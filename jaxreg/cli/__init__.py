@@ -1,4 +1,4 @@
-"""The command `jaxreg`: five programs; only the one that is called is loaded.
+"""The command `jaxreg`: seven programs; only the one that is called is loaded.
 
 Exit status: 0 success; 2 bad input; 3 finished, but do not trust the result; 130 interrupted.
 """
@@ -13,6 +13,8 @@ import tyro
 
 from jaxreg import __version__
 from jaxreg.cli import process
+from jaxreg.cli.align import Align
+from jaxreg.cli.export import Export
 from jaxreg.cli.info import Info
 from jaxreg.cli.options import SUCCESS, say, status_of
 from jaxreg.cli.register import Register
@@ -46,7 +48,15 @@ def main(arguments: list[str] | None = None) -> int:
     if given and given[0] in _WITH_CONFIGURATION:
         return importlib.import_module(f"jaxreg.cli.{given[0]}").main(given[1:])
     command: Any = tyro.extras.subcommand_cli_from_dict(
-        {"register": Register, "info": Info, "view": View, "train": _Train, "evaluate": _Evaluate},
+        {
+            "register": Register,
+            "align": Align,
+            "info": Info,
+            "view": View,
+            "train": _Train,
+            "evaluate": _Evaluate,
+            "export": Export,
+        },
         prog="jaxreg",
         description="Rigid registration of point clouds (jaxreg --version prints the version).",
         args=given,

@@ -44,8 +44,9 @@ class Options:
     rienet: str = ""
     """NPZ file with RIENet's published weights (not included)."""
     method: str = ""
-    """Another method: register, register_global, register_global_learned, icp, identity, or a
-    baseline such as open3d_fgr (a wrong name lists them all)."""
+    """Another method: register, register_global, register_global_learned, icp, identity, a learned one
+    with its authors' weights (cemnet:FILE, dcp:FILE), or a baseline such as open3d_fgr (a wrong name
+    lists them all)."""
     transforms: str = ""
     """NPZ file with `rotation` (n,3,3) and `translation` (n,3) of the pairs, from any program."""
     refine: str = ""
@@ -117,7 +118,8 @@ def _check(options: Options, path: Path) -> None:
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
             "--batch 1 or more."
         )
-    taken = [path, *(Path(p) for p in (options.transforms, options.rienet) if p)]
+    weights = options.method.partition(":")[2]  # of a peer, as in cemnet:FILE
+    taken = [path, *(Path(p) for p in (options.transforms, options.rienet, weights) if p)]
     for name, suffixes in _SUFFIXES.items():
         if getattr(options, name):
             output = Path(getattr(options, name))

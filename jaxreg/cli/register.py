@@ -94,10 +94,10 @@ class Register:
 
         _check_outputs(self)
         initial = io.read_matrix(self.initial) if self.initial else None
-        scans = [_checked(path, self.nonfinite) for path in (self.source, self.reference)]
+        scans = [checked_scan(path, self.nonfinite) for path in (self.source, self.reference)]
         source, reference = (scan.points for scan in scans)
         begin = time.perf_counter()
-        with _patience():
+        with patience():
             result = _registered(self, source, reference, initial)
         seconds = time.perf_counter() - begin
         lost: list[str] = []
@@ -205,7 +205,7 @@ def _check_outputs(command: Register) -> None:
         taken.append(path)
 
 
-def _checked(path: Path, nonfinite: str) -> "Scan":
+def checked_scan(path: Path, nonfinite: str) -> "Scan":
     """What is in a file, with points that `register` will accept."""
     from jaxreg import io
     from jaxreg.geometry import clouds
@@ -268,7 +268,7 @@ def _write_json(path: Path, command: Register, result: "ScanRegistration") -> No
 
 
 @contextlib.contextmanager
-def _patience() -> Iterator[None]:
+def patience(*, spinner: bool = True) -> Iterator[None]:
     """A spinner on a terminal; and one message when a program must first be compiled."""
     from jax import monitoring
 
@@ -283,7 +283,8 @@ def _patience() -> Iterator[None]:
 
     monitoring.register_event_listener(listen)
     try:
-        with Console(stderr=True, highlight=False).status("registering"):
+        waiting = Console(stderr=True, highlight=False).status("registering")
+        with waiting if spinner else contextlib.nullcontext():
             yield
     finally:
         monitoring.unregister_event_listener(listen)

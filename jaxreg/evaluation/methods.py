@@ -5,7 +5,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,8 @@ from jaxtyping import Float
 from jaxreg.batching import map_pairs
 from jaxreg.config import Config, ModelConfig
 from jaxreg.evaluation import baselines
-from jaxreg.network.model import Variables, iterate
+from jaxreg.network.model import Variables
+from jaxreg.peers import by_name, cemnet, dcp
 from jaxreg.peers.rienet import load_rienet
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
@@ -40,6 +41,15 @@ AFTER_TRAINING = ("iterations", "n_inliers", "robust_rounds")
 _OWN = ("identity", "icp", "register", "register_global", "register_global_learned")
 
 
+_LOADERS: dict[str, Callable[[str], tuple[Variables, Config]]] = {
+    "weights": load_pretrained,
+    "rienet": load_rienet,
+    "dcp": dcp.load_weights,
+    "cemnet": cemnet.load_weights,
+    "checkpoint": load_checkpoint,
+}
+
+
 class Outcome(NamedTuple):
     """A pose (numpy) and, for a method that judges itself, whether and how far to trust it."""
 
@@ -58,7 +68,8 @@ class Method(NamedTuple):
 def names() -> tuple[str, ...]:
     """The names that `choose` takes; FILE and DIR stand for a path."""
     released = tuple(f"weights:{name}" for name in available_weights())
-    return (*_OWN, *released, "rienet:FILE", "checkpoint:DIR", *baselines.NAMES)
+    files = (f"{name}:FILE" for name in _LOADERS if name not in ("weights", "checkpoint"))
+    return (*_OWN, *released, *files, "checkpoint:DIR", *baselines.NAMES)
 
 
 def choose(name: str, *, model: ModelConfig | None = None) -> Method:
@@ -66,10 +77,11 @@ def choose(name: str, *, model: ModelConfig | None = None) -> Method:
 
     `identity` does nothing. From this library: `icp` (point to point, from where the clouds are),
     `register` (with all its defaults), `register_global`, and `register_global_learned` (the same
-    with its released features). Trained networks: released weights, RIENet's NPZ file, the best
-    checkpoint of a run; if `model` is given, its `AFTER_TRAINING` fields replace those of the
-    training. The rest are other people's (`jaxreg.evaluation.baselines`), optionally with the
-    spacing of the points, as in `open3d_fgr@0.02`.
+    with its released features). Trained networks: released weights, an NPZ file of the state dict
+    of RIENet, DCP or CEMNet, the best checkpoint of a run; if `model` is given, its
+    `AFTER_TRAINING` fields replace those of the training. The rest are other people's
+    (`jaxreg.evaluation.baselines`), optionally with the spacing of the points, as in
+    `open3d_fgr@0.02`.
 
     Raises:
       ValueError: an unknown name (the message lists the known ones), a file or weights that do not
@@ -95,18 +107,13 @@ def choose(name: str, *, model: ModelConfig | None = None) -> Method:
 
 
 def load_network_of(name: str) -> tuple[Variables, Config]:
-    """Variables and configuration of `weights:NAME`, `rienet:FILE` or `checkpoint:DIR`.
+    """Variables and configuration of `weights:NAME`, `rienet:FILE` (`dcp`, `cemnet`), `checkpoint:DIR`.
 
     Raises:
       ValueError: there are no such weights, file or checkpoint.
     """
     kind, _, place = name.partition(":")
-    loaders = {
-        "weights": load_pretrained,
-        "rienet": load_rienet,
-        "checkpoint": load_checkpoint,
-    }
-    return loaders[kind](place)
+    return _LOADERS[kind](place)
 
 
 def trained_config(name: str) -> Config | None:
@@ -122,11 +129,11 @@ def trained_config(name: str) -> Config | None:
 
 def _is_network(name: str) -> bool:
     kind, colon, place = name.partition(":")
-    return kind in ("weights", "rienet", "checkpoint") and bool(colon and place)
+    return kind in _LOADERS and bool(colon and place)
 
 
 def _register_batch(
-    variables: Variables, pair: Pair, *, config: ModelConfig, padded: bool
+    variables: Variables, pair: Pair, *, config: Config, padded: bool
 ) -> RigidTransform:
     def one(source: PointCloud, reference: PointCloud) -> RigidTransform:
         if not padded:
@@ -134,7 +141,7 @@ def _register_batch(
                 PointCloud(points, jnp.ones(points.shape[0], bool))
                 for points in (source.points, reference.points)
             )
-        return iterate(variables, source, reference, config=config)[0]
+        return by_name.pose(variables, source, reference, config=config)
 
     return map_pairs(one)(pair.source, pair.reference)
 
@@ -142,23 +149,29 @@ def _register_batch(
 _register_batch_jit = jax.jit(_register_batch, static_argnames=("config", "padded"))
 
 
-def network_method(variables: Variables, config: ModelConfig) -> Batch:
+def network_method(variables: Variables, config: Config | ModelConfig) -> Batch:
     """The trained network. A batch without padding runs a separate program, a quarter faster."""
+    whole = config if isinstance(config, Config) else Config(model=config)
 
     def method(pair: Pair) -> RigidTransform:
         padded = not all(np.all(cloud.mask) for cloud in (pair.source, pair.reference))
-        return _register_batch_jit(variables, pair, config=config, padded=padded)
+        return _register_batch_jit(variables, pair, config=whole, padded=padded)
 
     return method
 
 
 def _network(variables: Variables, trained: Config, model: ModelConfig | None) -> Method:
-    config = trained.model
-    if model is not None:
-        chosen = {name: getattr(model, name) for name in AFTER_TRAINING}
-        config = dataclasses.replace(config, **chosen)
-    one = jax.jit(lambda x, y: iterate(variables, x, y, config=config)[0])
+    config = Config(network=trained.network, **_settings(trained, model))
+    one = jax.jit(lambda x, y: by_name.pose(variables, x, y, config=config))
     return Method(network_method(variables, config), _of_clouds(one))
+
+
+def _settings(trained: Config, model: ModelConfig | None) -> dict[str, Any]:
+    """The section that sets up the network; the rest of a configuration would compile it anew."""
+    if trained.network != "paper":
+        return {trained.network: getattr(trained, trained.network)}
+    chosen = {} if model is None else {name: getattr(model, name) for name in AFTER_TRAINING}
+    return {"model": dataclasses.replace(trained.model, **chosen)}
 
 
 _IDENTITY = RigidTransform(np.eye(3), np.zeros(3))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxreg.config import Config, check_options, option_name
+from jaxreg.config import PEERS, Config, check_options, option_name
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
@@ -170,13 +170,17 @@ def _without_effect(config: Config, name: str, method: str, transforms: str) -> 
         return "it belongs to the training; leave it out, or train with it"
     if name == "weights" and (method or transforms):
         return f"{method or transforms} is evaluated; leave out one of the two"
-    if section != "model" or not (method or transforms or config.weights):
+    sets_up = section in ("model", *PEERS) or name == "network"
+    if not sets_up or not (method or transforms or config.weights):
         return ""
     trained = methods.trained_config(_evaluated(config, method, transforms))
     if trained is None:
         return f"{method or transforms} is not a network; leave it out"
-    value = getattr(trained.model, field)
-    if field in methods.AFTER_TRAINING or value == getattr(config.model, field):
+    if section not in ("", "model" if trained.network == "paper" else trained.network):
+        return f"the weights are those of network = '{trained.network}'; leave it out"
+    there, here = (getattr(x, section) if section else x for x in (trained, config))
+    value = getattr(there, field)
+    if (section == "model" and field in methods.AFTER_TRAINING) or value == getattr(here, field):
         return ""
     return (
         f"the weights were trained with {field} = {value}; leave it out, or train with it and evaluate "

@@ -6,7 +6,6 @@ the origin, an angle of parallel vectors) it is zero, which is a valid subgradie
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg.geometry import arguments
@@ -56,7 +55,7 @@ def included_angle(u: Float[Array, "... 3"], v: Float[Array, "... 3"]) -> Float[
     u, v = arguments.numbers("u", u), arguments.numbers("v", v)
     arguments.one_dtype(u=u, v=v)
     try:
-        shape = np.broadcast_shapes(u.shape, v.shape)
+        shape = jnp.broadcast_shapes(u.shape, v.shape)
     except ValueError:
         shape = ()
     if not (u.shape[-1:] == v.shape[-1:] == shape[-1:] == (3,)):

@@ -56,7 +56,7 @@ def compose(second: RigidTransform, first: RigidTransform) -> RigidTransform:
     """
     batches = arguments.leading_axes("second", second), arguments.leading_axes("first", first)
     try:
-        batch = np.broadcast_shapes(*batches)
+        batch = jnp.broadcast_shapes(*batches)
     except ValueError:
         raise ValueError(
             f"transforms with the leading axes {batches[0]} and {batches[1]} do not match: give "

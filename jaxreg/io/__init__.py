@@ -10,7 +10,9 @@ from jaxreg.io import arrays, e57, las, mesh, packed, pcd, ptx, text, unread
 from jaxreg.io.arrays import read_numbers
 from jaxreg.io.contents import Scan
 from jaxreg.io.matrix import read_matrix
+from jaxreg.io.merged import read_colors, write_merged
 from jaxreg.io.places import check_folder, check_place, whole
+from jaxreg.io.poses import check_poses_output, read_pairs_log, read_poses, write_poses
 from jaxreg.io.writing import WRITERS, check_output, check_writable, write_cloud, write_moved
 
 __all__ = [
@@ -20,15 +22,21 @@ __all__ = [
     "check_folder",
     "check_output",
     "check_place",
+    "check_poses_output",
     "check_writable",
     "read_cloud",
+    "read_colors",
     "read_matrix",
     "read_numbers",
+    "read_pairs_log",
+    "read_poses",
     "read_scan",
     "suffix",
     "whole",
     "write_cloud",
+    "write_merged",
     "write_moved",
+    "write_poses",
 ]
 
 _READERS: dict[str, Callable[[Path], Scan]] = {

@@ -48,6 +48,11 @@ def more(path: Path) -> tuple[str, ...]:
     return tuple(p.name for p in _told(path)["vertex"].properties if p.name not in "xyz")
 
 
+def vertices(path: Path) -> np.ndarray:
+    """The rows of the element `vertex`, with all their properties."""
+    return _told(path)["vertex"].data
+
+
 def has_faces(path: Path) -> bool:
     """Whether the header announces faces; False also where there is none to read."""
     with contextlib.suppress(OSError), path.open("rb") as file:

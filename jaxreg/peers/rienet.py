@@ -13,6 +13,7 @@ import numpy as np
 from jaxreg.config import Config, LossConfig, ModelConfig
 from jaxreg.io.arrays import read_arrays
 from jaxreg.network.model import Variables
+from jaxreg.peers import state_dict
 
 _MODEL = ModelConfig(
     k=4,  # Its k = 5 counts the point itself; its neighbourhood sum leaves it out again.
@@ -41,22 +42,11 @@ def load_rienet(path: str | Path) -> tuple[Variables, Config]:
     """
     arrays = read_arrays(path, remedy="give the .npz of RIENet's state dict")
     try:
-        networks = {"features": _features(arrays), "inliers": _inliers(arrays)}
+        features = state_dict.dgcnn(arrays, "emb_nn.model.", layers=5)
+        networks = {"features": features, "inliers": _inliers(arrays)}
     except KeyError as error:
         raise ValueError(f"{path} has no array {error}: give RIENet's whole state dict.") from None
-    variables = {
-        kind: {name: tree[kind] for name, tree in networks.items()}
-        for kind in ("params", "batch_stats")
-    }
-    return variables, Config(model=_MODEL, loss=_LOSS)
-
-
-def _features(arrays: Mapping[str, np.ndarray]) -> Variables:
-    params, statistics = {}, {}
-    for i in range(5):
-        params[f"Dense_{i}"] = _dense(arrays, f"emb_nn.model.conv{i + 1}")
-        _batch_norm(arrays, f"emb_nn.model.bn{i + 1}", f"BatchNorm_{i}", params, statistics)
-    return {"params": params, "batch_stats": statistics}
+    return state_dict.joined(networks), Config(model=_MODEL, loss=_LOSS)
 
 
 def _inliers(arrays: Mapping[str, np.ndarray]) -> Variables:
@@ -66,32 +56,13 @@ def _inliers(arrays: Mapping[str, np.ndarray]) -> Variables:
         params[f"Conv_{i}"] = _convolution(arrays, root + layer)
     # Flax numbers the last layer before the one it is applied to.
     for i, layer in enumerate(("2.0", "2.3", "3.0", "3.3", "4.3", "4.0")):
-        params[f"Dense_{i}"] = _dense(arrays, root + layer)
+        params[f"Dense_{i}"] = state_dict.dense(arrays, root + layer)
     for i, layer in enumerate(("1.1", "1.4", "2.1", "2.4", "3.1", "3.4", "4.1")):
-        _batch_norm(arrays, root + layer, f"BatchNorm_{i}", params, statistics)
+        state_dict.batch_norm(arrays, root + layer, f"BatchNorm_{i}", params, statistics)
     return {"params": params, "batch_stats": statistics}
-
-
-def _dense(arrays: Mapping[str, np.ndarray], name: str) -> Variables:
-    """A convolution of width 1 as a dense layer: weight (out, in, 1, ...) to kernel (in, out)."""
-    weight = arrays[f"{name}.weight"]
-    layer = {"kernel": jnp.asarray(weight.reshape(weight.shape[:2]).T)}
-    if f"{name}.bias" in arrays:
-        layer["bias"] = jnp.asarray(arrays[f"{name}.bias"])
-    return layer
 
 
 def _convolution(arrays: Mapping[str, np.ndarray], name: str) -> Variables:
     """A convolution along the neighbours: weight (out, in, 3, 1) to kernel (3, in, out)."""
     kernel = arrays[f"{name}.weight"][..., 0].transpose(2, 1, 0)
     return {"kernel": jnp.asarray(kernel), "bias": jnp.asarray(arrays[f"{name}.bias"])}
-
-
-def _batch_norm(arrays, name: str, ours: str, params: Variables, statistics: Variables) -> None:
-    """Adds a BatchNorm to `params` and `statistics`, in place; both nest one module in another."""
-    scale, bias, mean, var = (
-        jnp.asarray(arrays[f"{name}.{part}"])
-        for part in ("weight", "bias", "running_mean", "running_var")
-    )
-    params[ours] = {"BatchNorm_0": {"scale": scale, "bias": bias}}
-    statistics[ours] = {"BatchNorm_0": {"mean": mean, "var": var}}

@@ -15,8 +15,8 @@ from jaxreg.scans import planes
 from jaxreg.scans.prepare import Prepared
 from jaxreg.types import RigidTransform
 
-_SAMPLE = 4000
-"""Points of the source that are compared."""
+_GLANCE, _SAMPLE = 500, 4000
+"""Points of the source that are compared: at first, and where these are suspicious."""
 _OFF = 8.0
 """A point this many noise levels from the other surface is off it."""
 _STEP = 0.1
@@ -64,13 +64,18 @@ class Agreement(NamedTuple):
 
 
 def agreement(
-    source: Prepared, reference: Prepared, pose: RigidTransform, scale: float = 1.0
+    source: Prepared,
+    reference: Prepared,
+    pose: RigidTransform,
+    scale: float = 1.0,
+    count: int = _SAMPLE,
 ) -> Agreement:
     """How well `source`, times `scale` about its centre and then moved by `pose`, fits `reference`.
 
-    The pose maps the centred source to the centred reference, both in the unit of the input.
+    `count` of its points are compared. The pose maps the centred source to the centred reference, both
+    in the unit of the input.
     """
-    some, noise = _sampled(source)
+    some, noise = _sampled(source, count)
     moved = scale * some @ pose.rotation.T + pose.translation
     patches = _patches(reference, moved)
     off, beside = planes.offsets(moved, patches)
@@ -84,6 +89,14 @@ def agreement(
     return Agreement(float(over.mean()), float(np.mean(off > _OFF * floored)), spread)
 
 
+def at_a_glance(source: Prepared, reference: Prepared, pose: RigidTransform) -> Agreement:
+    """`agreement` of few points, and of many only if these leave doubts; most pairs need no more."""
+    few = agreement(source, reference, pose, count=_GLANCE)
+    doubtful = few.off >= 0.4 * _SUSPECT or few.spread >= 0.95 * _SPREAD
+    doubtful = doubtful and few.compared >= 0.9 * _ENOUGH
+    return agreement(source, reference, pose) if doubtful else few
+
+
 def at_another_size(
     source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
 ) -> tuple[float, Agreement]:
@@ -91,7 +104,7 @@ def at_another_size(
 
     Gauss-Newton on distances from planes, with a kernel that narrows to the noise; seven unknowns.
     """
-    some, noise = _sampled(source)
+    some, noise = _sampled(source, _SAMPLE)
     unit = reference.radius
     narrowest = min(3 * float(np.median(noise)) + _STEP * reach, reach)
     found = planes.fitted(
@@ -113,9 +126,9 @@ def size_text(scale: float, now: Agreement, then: Agreement) -> str:
     return f"The source fits at {scale:.3f} of its size."
 
 
-def _sampled(cloud: Prepared) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(cloud: Prepared, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points of the cloud about its centre in the unit of the input, and the noise there."""
-    rows = np.linspace(0, len(cloud.points) - 1, min(_SAMPLE, len(cloud.points))).astype(int)
+    rows = np.linspace(0, len(cloud.points) - 1, min(count, len(cloud.points))).astype(int)
     points = cloud.points[rows]
     noise = planes.patches(cloud.points, cloud.tree, points).noise
     return points * cloud.radius, noise * cloud.radius

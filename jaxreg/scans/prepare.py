@@ -25,6 +25,8 @@ from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
 
+_FOURTH = 4
+"""The neighbour whose distance is the spacing; see `spacing`."""
 FINEST = 1e-6
 """The resolution of float32 in a cloud of radius 1: a smaller spacing counts as zero."""
 _CUBES = 1 << 20
@@ -56,8 +58,11 @@ class Level:
 
     @functools.cached_property
     def spacing(self) -> float:
-        """See `spacing`."""
-        return spacing(self.points, self.index.tree)
+        """See `spacing`; by the neighbours that the index has found anyway, if it has four."""
+        if min(self.k, len(self.points) - 1) < _FOURTH:
+            return spacing(self.points, self.index.tree)
+        fourth = self.index.neighbors[: len(self.points), _FOURTH - 1]
+        return float(np.median(np.linalg.norm(self.points - self.points[fourth], axis=1)))
 
     @functools.cached_property
     def examined(self) -> Examined:
@@ -254,7 +259,7 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
 
     On a surface covered by squares of edge a, one point each, this is about a; 0 for a single point.
     """
-    k = min(4, len(points) - 1)
+    k = min(_FOURTH, len(points) - 1)
     if k < 1:
         return 0.0
     found = cKDTree(points) if tree is None else tree

@@ -86,10 +86,11 @@ class Problem(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The chosen pose in the frame, and the others with their log odds."""
+    """The chosen pose in the frame, the others with their log odds, and how likely it is right."""
 
     pose: RigidTransform
     others: tuple[tuple[RigidTransform, float], ...]
+    probability: float = 1.0
 
 
 def registered(
@@ -98,11 +99,16 @@ def registered(
     config: RegisterConfig,
     start: RigidTransform | None,
     known: Known,
+    *,
+    least: float = 0.0,
 ) -> ScanRegistration:
-    """The registration of two scans of surfaces."""
+    """The registration of two scans of surfaces.
+
+    A pose whose probability is below `least` after the search is left as the search had it.
+    """
     problem = pose_problem(source, reference, config, known)
     if start is None:
-        return finished(problem, searched(problem))
+        return finished(problem, searched(problem), least=least)
     return finished(problem, Found(frame.transform_in(problem.where, start), ()))
 
 
@@ -139,7 +145,11 @@ def searched(problem: Problem) -> Found:
     best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
     poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
     others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
-    return Found(poses[best], tuple((poses[i], float(found.score[i])) for i in others))
+    return Found(
+        poses[best],
+        tuple((poses[i], float(found.score[i])) for i in others),
+        float(probabilities(found.score)[best]),
+    )
 
 
 def closer(problem: Problem) -> Problem | None:
@@ -250,7 +260,7 @@ def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
     """The last stage where parts have moved; where that is not why points disagree, the cause."""
     source, reference = problem.source, problem.reference
     pose = _lengthened(refined.transform, problem.where)
-    now = dense.agreement(source, reference, pose)
+    now = dense.at_a_glance(source, reference, pose)
     weights = problem.known.weights
     if weights is None and not (now.suspicious or now.drawn):
         return _Closing()
@@ -284,10 +294,13 @@ def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
     return RigidTransform(pose.rotation, pose.translation * float(where.length))
 
 
-def finished(problem: Problem, found: Found) -> ScanRegistration:
+def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegistration:
     """The chosen pose refined, looked at with all points, and judged beside the others."""
-    refined = refine_pose(problem, found.pose)
-    closing = _with_all_points(problem, refined)
+    if found.probability < least:
+        refined, closing = unrefined(found.pose), _Closing()
+    else:
+        refined = refine_pose(problem, found.pose)
+        closing = _with_all_points(problem, refined)
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause
     covariance = problem.known.conditional(_covariance(refined.uncertainty, length))

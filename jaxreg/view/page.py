@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxreg.scans import summary
-from jaxreg.scans.result import ScanRegistration
+from jaxreg.scans.result import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
 
 _SHOWN = 20_000
@@ -31,37 +31,38 @@ def write_registration_page(
 ) -> None:
     """Write an HTML page: both clouds, a before/after switch, confidence colours, numbers, verdict.
 
-    Points that are not finite are left out. Large clouds are thinned evenly for display.
+    Where other poses may be right, one can step through them. Points that are not finite are left
+    out. Large clouds are thinned evenly for display.
     """
     rows = shown_rows(source)
-    origin = _middle(reference)
+    origin = middle(reference)
     shift = brought_near(source[rows], reference[shown_rows(reference)])
     clouds = [
-        _cloud(names[0], source[rows] + shift, origin, len(source), moves=True)
+        packed_cloud(names[0], source[rows] + shift, origin, len(source), moves=True)
         | {"confidence": _packed(np.round(255 * result.confidence[rows]).astype(np.uint8))},
-        _cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
+        packed_cloud(names[1], _shown(reference), origin, len(reference), colour="reference"),
     ]
     content = {
         "clouds": clouds,
-        "motion": _motion(result, source[rows], origin, shift),
+        "motions": _motions(result, source[rows], origin, shift),
         "figures": [[name, value] for name, value in summary.figures(result).items()],
         "verdict": {"text": summary.verdict_line(result), "good": result.success},
     }
-    _write(path, f"{names[0]} on {names[1]}", content)
+    write_content(path, f"{names[0]} on {names[1]}", content)
 
 
 def write_page(path: str | Path, clouds: Mapping[str, Float[np.ndarray, "n 3"]]) -> None:
     """Write an HTML page with clouds as they are, all in one frame."""
-    origin = _middle(np.concatenate([_shown(points) for points in clouds.values()]))
+    origin = middle(np.concatenate([_shown(points) for points in clouds.values()]))
     shown = [
-        _cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
+        packed_cloud(name, _shown(points), origin, len(points), colour=_COLOURS[i % len(_COLOURS)])
         for i, (name, points) in enumerate(clouds.items())
     ]
     sizes = [
         [name, " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))]
         for name, points in clouds.items()
     ]
-    _write(path, ", ".join(clouds), {"clouds": shown, "motion": None, "figures": sizes})
+    write_content(path, ", ".join(clouds), {"clouds": shown, "motions": [], "figures": sizes})
 
 
 def draw_registration(
@@ -99,7 +100,8 @@ def _headline(result: ScanRegistration, source: np.ndarray, *, shortened: bool) 
     return [summary.verdict_line(result), motion + note]
 
 
-def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
+def write_content(path: str | Path, title: str, content: dict[str, Any]) -> None:
+    """Write the page of a content: `clouds`, `motion`, `figures`, and what else the viewer knows."""
     template = (resources.files("jaxreg.view") / "viewer.html").read_text("utf-8")
     # "</script" would end the element that holds the data, "<!--" could swallow its end.
     data = json.dumps(content).replace("<", "\\u003c")
@@ -107,7 +109,7 @@ def _write(path: str | Path, title: str, content: dict[str, Any]) -> None:
     Path(path).write_text(page, encoding="utf-8")
 
 
-def _cloud(
+def packed_cloud(
     name: str,
     points: np.ndarray,
     origin: np.ndarray,
@@ -143,22 +145,33 @@ def brought_near(
     return np.zeros(3) if distance <= 1.5 * near else way * (near / distance - 1)
 
 
-def _motion(
+def _motions(
     result: ScanRegistration, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
+) -> list[dict[str, Any]]:
+    """The pose found, then its alternatives, each with its probability."""
+    poses = [Alternative(result.transform, result.probability), *result.alternatives]
+    return [
+        {"probability": f"{pose.probability:.2f}"} | _motion(pose.transform, source, origin, shift)
+        for pose in poses
+    ]
+
+
+def _motion(
+    pose: RigidTransform, source: np.ndarray, origin: np.ndarray, shift: np.ndarray
 ) -> dict[str, Any]:
     """The motion as a turn about the source's centroid and the path of that centroid.
 
     The page shows the source shifted before the motion, and ends where the motion ends.
     """
-    axis, angle = summary.axis_angle(result.rotation)
+    axis, angle = summary.axis_angle(pose.rotation)
     centre = source.mean(axis=0)
-    before, after = centre + shift, result.rotation @ centre + result.translation
+    before, after = centre + shift, pose.rotation @ centre + pose.translation
     ways = {"before": (before - origin).tolist(), "after": (after - origin).tolist()}
     return {"axis": axis.tolist(), "angle": angle, "shortened": bool(shift.any())} | ways
 
 
-def _middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
+def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """The middle of the box of finite points. Coordinates are shown relative to this: UTM offsets do not fit JavaScript's float32 arrays."""
     finite = points[np.isfinite(points).all(axis=1)]
     return (finite.min(axis=0) + finite.max(axis=0)) / 2
 
@@ -167,12 +180,12 @@ def _shown(points: np.ndarray) -> np.ndarray:
     return points[shown_rows(points)]
 
 
-def shown_rows(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "k"]:
+def shown_rows(points: Float[np.ndarray, "n 3"], *, most: int = _SHOWN) -> Int[np.ndarray, "k"]:
     """The finite rows, or an even share of them if a picture needs no more."""
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(rows) <= _SHOWN:
+    if len(rows) <= most:
         return rows
-    return np.sort(np.random.default_rng(0).choice(rows, _SHOWN, replace=False))
+    return np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
 
 
 def _packed(array: np.ndarray) -> str:

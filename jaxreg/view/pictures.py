@@ -32,6 +32,7 @@ _VALIDATION = {
     "val_median_rre_deg": "median angle",
 }
 _CURVE_POINTS = 400
+_MOST_LABELS = 20
 
 
 def plot_pair(
@@ -73,6 +74,35 @@ def plot_pair(
     named = {"source": SOURCE, "reference": REFERENCE, "aligned source": ALIGNED}
     dots = [Line2D([], [], marker="o", ls="", color=c, label=name) for name, c in named.items()]
     figure.legend(handles=dots, loc="outside lower center", ncols=3, frameon=False)
+    figure.savefig(path, dpi=150, facecolor="white")
+
+
+def plot_clouds(
+    clouds: list[Float[np.ndarray, "_ 3"]],
+    colors: list[tuple[float, float, float]],
+    path: str | Path,
+    *,
+    title: str = "",
+    labels: list[str] | None = None,
+) -> None:
+    """Draw clouds in one frame from two sides, each in its colour (PNG, PDF or SVG, by the suffix).
+
+    Up to 20 `labels` are listed below.
+    """
+    figure = Figure(figsize=(12, 6.6), layout="constrained")
+    panels = figure.subplots(1, len(_VIEWS_DEG))
+    everything = np.concatenate([*clouds, *([] if clouds else [np.zeros((1, 3))])])
+    shades = np.repeat(np.array(colors).reshape(-1, 3), [len(cloud) for cloud in clouds], axis=0)
+    shades = shades if clouds else np.zeros((1, 3))
+    for axes, view in zip(panels, _VIEWS_DEG, strict=True):
+        draw_clouds(axes, [(everything, shades)], view, project(everything, view))
+    figure.suptitle(title, fontsize=12)
+    if labels and len(labels) <= _MOST_LABELS:
+        dots = [
+            Line2D([], [], marker="o", ls="", color=color, label=label)
+            for color, label in zip(colors, labels, strict=True)
+        ]
+        figure.legend(handles=dots, loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(path, dpi=150, facecolor="white")
 
 

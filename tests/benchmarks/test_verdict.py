@@ -37,6 +37,7 @@ def test_a_pair_is_what_its_kind_says(kind, seed):
     assert distance.min() > 0, "the two share no point"
 
 
+@pytest.mark.slow
 def test_registering_the_pairs_finds_the_right_pose(monkeypatch, records):
     monkeypatch.setattr(
         verdict,

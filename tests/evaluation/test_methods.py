@@ -43,7 +43,10 @@ def angle_deg(found, truth):
     return np.degrees(Rotation.from_matrix(turn).magnitude())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n == "register_global_learned")) for n in NAMES],
+)
 def test_every_name_is_a_method_of_a_batch_and_of_two_clouds(name, pair):
     method = chosen(name)
     outcome = method.clouds(pair.source.points, pair.reference.points)
@@ -86,6 +89,8 @@ def test_all_that_the_library_has_is_in_the_list():
         ("weights:magic", "modelnet40_first20"),
         ("checkpoint:nowhere", "no checkpoint in nowhere"),
         ("rienet:nowhere.npz", "nowhere.npz"),
+        ("dcp:nowhere.npz", "nowhere.npz: no such file; give the .npz of DCP's"),
+        ("cemnet:nowhere.npz", "nowhere.npz: no such file; give the .npz of CEMNet's"),
     ],
 )
 def test_a_wrong_name_says_what_there_is(name, message):
@@ -131,6 +136,14 @@ def test_rienet_is_a_method(pair, peers_root):
     outcome = methods.choose(name).clouds(pair.source.points, pair.reference.points)
     assert angle_deg(outcome.transform, pair.transform) < 0.1
     assert methods.trained_config(name).model.inlier_network == "rienet"
+
+
+@pytest.mark.peers
+def test_a_peer_is_a_method(pair, peers_root):
+    name = f"dcp:{peers_root / 'dcp_v1.npz'}"
+    outcome = methods.choose(name).clouds(pair.source.points, pair.reference.points)
+    assert angle_deg(outcome.transform, pair.transform) < 5
+    assert methods.trained_config(name).network == "dcp"
 
 
 def test_only_networks_have_a_configuration_of_their_training():

@@ -114,6 +114,7 @@ def test_a_refined_method_says_so_and_is_better(config):
     assert refined["mie_r_deg"] < plain["mie_r_deg"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["register", "register_global", "register_global_learned"])
 def test_the_methods_for_any_rotation_are_scored_by_name(config, method):
     pairs = PairConfig(512, kept=400, sampling="disjoint", rotation="full")

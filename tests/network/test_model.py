@@ -225,6 +225,7 @@ def gradient_of(config: ModelConfig):
     return jax.jit(jax.grad(value, (0, 1, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fill", [1e6, np.nan])
 def test_padding_changes_no_derivative(rng, fill):
     """T18."""
@@ -395,6 +396,7 @@ def batch_of(pairs, rows, fill):
     return (*clouds, *masks)
 
 
+@pytest.mark.slow
 def test_padding_changes_neither_the_training_loss_nor_its_gradient(rng):
     """T18."""
     variables = variables_of(SMALL)

@@ -18,6 +18,10 @@ from tests.refine.kernels import KERNELS
 
 METHODS = {"point_to_plane": point_to_plane, "gicp": gicp}
 both = pytest.mark.parametrize("method", METHODS)
+gicp_first = pytest.mark.parametrize(
+    "method", ["gicp", pytest.param("point_to_plane", marks=pytest.mark.slow)]
+)
+"""For what takes long, and differs in the residual alone."""
 
 
 def surface(rng, n):
@@ -80,6 +84,7 @@ def test_common_motion_conjugates_the_result(method, seed):
     np.testing.assert_allclose(moved.translation, expected.translation, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_swapped_clouds_stay_near_the_inverse(seed):
     # Near: the metric is held while a pose turns, and it turns about the points of the moving cloud.
     source, reference, _ = make_pair(seed)
@@ -91,6 +96,7 @@ def test_swapped_clouds_stay_near_the_inverse(seed):
     np.testing.assert_allclose(backward.translation, inverse.translation, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_swapped_copies_stay_at_the_inverse(seed):
     # Without residuals nothing that is held pulls.
     source, _, truth = make_pair(seed)
@@ -116,7 +122,7 @@ def test_scale_of_the_clouds_does_not_matter(method, dtype, factor, seed):
     np.testing.assert_allclose(scaled.translation / factor, plain.translation, atol=tolerance)
 
 
-@both
+@gicp_first
 @pytest.mark.parametrize("kernel", ["none", "geman_mcclure"])
 def test_derivatives_equal_finite_differences(method, kernel, seed):
     source, reference, _ = make_pair(seed, n=40, m=50)
@@ -146,7 +152,7 @@ def degenerate_clouds(n=24):
     return jnp.asarray(np.stack(list(clouds.values())))
 
 
-@both
+@gicp_first
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("offset", [0.0, 0.01])
 def test_finite_at_degenerate_clouds(method, dtype, offset):
@@ -165,7 +171,7 @@ def test_finite_at_degenerate_clouds(method, dtype, offset):
     assert all(np.isfinite(g).all() for g in gradients)
 
 
-@both
+@gicp_first
 def test_no_overlap_keeps_the_initial_pose(method, seed):
     source, reference, _ = make_pair(seed)
     arguments = (METHODS[method], source, reference + 100)
@@ -177,7 +183,7 @@ def test_no_overlap_keeps_the_initial_pose(method, seed):
     assert all(np.isfinite(g).all() for g in gradients)
 
 
-@both
+@gicp_first
 def test_padding_changes_nothing(method, seed):
     x, y, _ = make_pair(seed, n=40, m=50)
     options = {"config": RefineConfig(iterations=4, both_directions=True)}

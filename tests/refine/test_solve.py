@@ -14,9 +14,9 @@ from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine as eager_refine
 from jaxreg.types import RigidTransform
 from tests.compiled import gicp, icp, point_to_plane, refine
+from tests.refine.kernels import SHARED
 
-METHODS = ["icp", "point_to_plane", "gicp"]
-each_method = pytest.mark.parametrize("method", METHODS)
+each_method = pytest.mark.parametrize("method", SHARED)
 
 
 def surface(rng, n):
@@ -176,6 +176,7 @@ def test_the_start_keeps_its_derivative_along_a_plane_only(seed):
     )
 
 
+@pytest.mark.slow
 def test_implicit_memory_does_not_grow_with_the_iterations():
     def temporary(gradient, iterations):
         config = RefineConfig("icp", iterations=iterations, gradient=gradient)
@@ -283,6 +284,7 @@ def test_padding_is_trusted_by_nothing_and_stays_finite(method, seed):
         np.testing.assert_allclose(getattr(result, name), getattr(plain, name), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_name_of_a_method_is_that_of_a_function(seed):
     clouds = make_pair(seed)
     start = RigidTransform(jnp.eye(3), jnp.array([0.03, 0.0, 0.01]))
@@ -314,6 +316,7 @@ def test_keywords_win_over_the_configuration_and_may_be_traced(method, seed):
     np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @each_method
 def test_copies_correspond_in_batches_too(method, seed):
     """XLA computes the moved points of a batch again when their distances are compared."""

@@ -88,6 +88,7 @@ def test_another_size_is_found_from_a_pose_nearby(rng, factor):
     assert not dense.size_text(scale, now, now)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "told"),
     [(np.array([1.0, -1.0, 1.0]), "mirrored source fits better"), (1.05, "The source fits at 1.0")],

@@ -343,6 +343,7 @@ def test_awkward_clouds_give_a_finite_rotation(name):
         assert name not in FIXES_NO_POSE or not found.success
 
 
+@pytest.mark.slow
 def test_a_regular_grid_is_laid_on_the_grid(rng):
     """T25: every point looks like every other; any symmetry of the cube is as good."""
     axis = np.arange(3.0)
@@ -474,6 +475,7 @@ def test_other_settings_than_a_cloud_was_prepared_with_are_refused(pair):
         register(cloud, pair[1])
 
 
+@pytest.mark.slow
 def test_a_wrong_pose_says_why_and_names_the_others(pair):
     """`reason` and `alternatives`: of unlike shapes, of a plane, and of a shape with symmetries."""
     unlike = register(halves(STAIRS)[0], halves(1)[1])

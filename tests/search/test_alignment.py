@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
@@ -65,6 +66,7 @@ def test_padding_changes_nothing_and_no_pair_keeps_the_pose(seed):
     np.testing.assert_allclose(kept.rotation, start.rotation, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivative_of_the_fine_alignment(seed):
     source, reference, _, start = pair(seed, n=40, m=50)
 

@@ -80,6 +80,7 @@ def test_cosines_are_those_of_standardised_features(seed):
     np.testing.assert_allclose(found.reference.local, local[60:], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_clouds_described_one_by_one_give_the_poses_of_the_search(seed):
     """Around their own origins, in one unit; then the frame is left by hand."""
     source, reference = (points[:150] for points in make_pair(seed, scale=30.0)[:2])

@@ -33,6 +33,7 @@ def solve(*clouds):
     return solve_and_grad(*clouds)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_any_rotation_of_another_sampling_with_padding(scale, seed):
     source, reference, turn = make_pair(seed, scale)

@@ -14,12 +14,16 @@ import pytest
 from tests.transforms.core_rows import core_rows
 from tests.transforms.judge_rows import judge_rows
 from tests.transforms.network_rows import network_and_model_rows
+from tests.transforms.peer_rows import peer_rows
 from tests.transforms.refine_rows import refine_rows
 from tests.transforms.search_rows import search_rows
 
 WHOLE = (
     "network.losses.step_losses",
     "network.model.iterate",
+    "peers.cemnet.register",
+    "peers.idam.register",
+    "peers.rpmnet.register",
     "refine.methods.refine",
     "search.pipeline.register_global",
     "search.pipeline.search_poses",
@@ -28,7 +32,14 @@ WHOLE = (
 """Whole programs that take long to compile, or long one operation at a time, and whose parts are rows
 of their own: what `make test` leaves out, `make slow` runs."""
 
-TABLE = core_rows() | network_and_model_rows() | refine_rows() | search_rows() | judge_rows()
+TABLE = (
+    core_rows()
+    | network_and_model_rows()
+    | peer_rows()
+    | refine_rows()
+    | search_rows()
+    | judge_rows()
+)
 
 
 def rows(names, *, slow=()):

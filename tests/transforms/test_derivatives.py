@@ -72,7 +72,13 @@ def derivatives(name, row, inputs, rng):
 DIFFERENTIABLE = sorted(name for name, row in TABLE.items() if row.generic)
 
 
-@rows(DIFFERENTIABLE, slow=WHOLE)
+HEAVY = {name for name in DIFFERENTIABLE if name.startswith("refine.")} | {
+    "network.model.register_pair"
+}
+"""Compared with differences in the tests of their own rooms, too."""
+
+
+@rows(DIFFERENTIABLE, slow=HEAVY | set(WHOLE))
 def test_derivatives_at_generic_inputs(name, row, seed):
     rng = np.random.default_rng(seed)
     _, tangent, gradient, at, products = derivatives(name, row, row.generic, rng)

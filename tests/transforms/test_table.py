@@ -26,11 +26,14 @@ HOST |= {
     "view.pictures.plot_pair",
 }
 HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training.train"}
+HOST |= {"peers.dcp.load_weights", "peers.cemnet.load_weights"}
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
+HOST |= {"network.batch.register_batch", "exported.export_program", "exported.load_exported"}
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
-"""Transformed in their own tests: test_batching.py, data/test_pairs.py and test_training.py."""
+ELSEWHERE |= {"peers.idam.loss", "peers.rpmnet.loss"}
+"""Transformed in their own tests: test_batching.py, data/test_pairs.py, test_training.py and peers/."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}
@@ -48,6 +51,10 @@ ROOMS = (
     "network.inliers",
     "network.model",
     "network.losses",
+    "peers.dcp",
+    "peers.cemnet",
+    "peers.idam",
+    "peers.rpmnet",
     "geometry.frame",
     "refine.config",
     "refine.cost",

@@ -29,7 +29,10 @@ def jitted(name: str) -> Callable:
     return jax.jit(TABLE[name].function)
 
 
-@rows(PLAIN, slow=[name for name in PLAIN if name.startswith(("network.", "refine.", "search."))])
+@rows(
+    PLAIN,
+    slow=[name for name in PLAIN if name.startswith(("network.", "peers.", "refine.", "search."))],
+)
 def test_jit_equals_eager(name, row):
     for inputs in (row.generic, *row.degenerate[:1]):
         assert_close(jitted(name)(*inputs), row.function(*arrays(inputs)), row.rounding)

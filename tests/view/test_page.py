@@ -12,13 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
-from jaxreg.scans.result import ScanRegistration
+from jaxreg.scans.result import Alternative, ScanRegistration
+from jaxreg.types import RigidTransform
 from jaxreg.view import page
 
 POSE = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
 
 
-def registration(source, reference, *, rotation=POSE, translation=(0.0, 0, 0), success=True):
+def registration(
+    source, reference, *, rotation=POSE, translation=(0.0, 0, 0), success=True, alternatives=()
+):
     translation = np.asarray(translation, float)
     return ScanRegistration(
         rotation=rotation,
@@ -28,7 +31,7 @@ def registration(source, reference, *, rotation=POSE, translation=(0.0, 0, 0), s
         correspondences=source @ rotation.T + translation,
         max_correspondence_distance=0.1,
         reason="" if success else "Only 60% of the points lie near the other cloud.",
-        alternatives=(),
+        alternatives=alternatives,
         converged=True,
         fitness=0.75,
         inlier_rmse=0.01,
@@ -73,7 +76,7 @@ def test_page_holds_the_clouds_and_ends_at_the_pose(tmp_path, seed, offset):
     moving, fixed = (points_of(cloud) for cloud in content["clouds"])
     np.testing.assert_allclose(moving - moving[0], source - source[0], atol=2e-4)
     np.testing.assert_allclose(fixed - moving[0], reference - source[0], atol=2e-4)
-    motion = content["motion"]
+    motion = content["motions"][0]
     turn = Rotation.from_rotvec(motion["angle"] * np.array(motion["axis"])).as_matrix()
     aligned = (moving - motion["before"]) @ turn.T + motion["after"]
     np.testing.assert_allclose(aligned, fixed, atol=3e-4)
@@ -87,7 +90,7 @@ def test_far_clouds_are_brought_near_and_still_meet(tmp_path, seed):
     page.write_registration_page(tmp_path / "r.html", source, reference + far, result)
     content = content_of(tmp_path / "r.html")
     moving, fixed = (points_of(cloud) for cloud in content["clouds"])
-    motion = content["motion"]
+    motion = content["motions"][0]
     assert motion["shortened"]
     assert np.linalg.norm(moving.mean(axis=0) - fixed.mean(axis=0)) < 3
     turn = Rotation.from_rotvec(motion["angle"] * np.array(motion["axis"])).as_matrix()
@@ -272,6 +275,32 @@ def test_confidence_colours_the_source_and_explains_itself(browser, page_uri, da
     assert not scale.is_displayed()
 
 
+def test_one_can_step_through_the_alternatives(browser, tmp_path):
+    source, reference, translation = scans(2)
+    unmoved = Alternative(RigidTransform(np.eye(3), np.zeros(3)), 0.41)
+    result = registration(source, reference, translation=translation, alternatives=(unmoved,))
+    page.write_registration_page(tmp_path / "r.html", source, reference, result)
+    uri = (tmp_path / "r.html").as_uri()
+    opened(browser, uri, width=375)
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 375
+    opened(browser, uri)
+    first, told = canvas(browser), browser.find_element("id", "pose")
+    assert told.text == "pose 1 of 2, probability 0.97"
+    assert not browser.find_element("id", "previous").is_enabled()
+    click(browser, "confidence")
+    click(browser, "next")
+    assert told.text == "pose 2 of 2, probability 0.41"
+    assert not browser.find_element("id", "next").is_enabled()
+    assert not browser.find_element("id", "confidence").is_enabled(), "it belongs to the first pose"
+    other = canvas(browser)
+    apart = np.linalg.norm(middle(green(other)) - middle(amber(other)))
+    assert apart > 100, "the other pose leaves the source where it was"
+    browser.find_element("id", "view").send_keys("[")
+    np.testing.assert_array_equal(canvas(browser), first)
+    told = [entry["message"] for entry in browser.get_log("browser")]
+    assert [text for text in told if "getImageData" not in text] == []
+
+
 def test_figures_and_verdict_are_there(browser, page_uri):
     opened(browser, page_uri)
     assert browser.find_element("id", "verdict").text == "success (probability 0.97)"
@@ -312,7 +341,9 @@ def test_phone_width_needs_no_sideways_scrolling(browser, page_uri):
     opened(browser, page_uri, width=375)
     wide = browser.execute_script("return document.documentElement.scrollWidth")
     assert wide <= 375
-    for button in browser.find_elements("tag name", "button"):
+    buttons = [b for b in browser.find_elements("tag name", "button") if b.is_displayed()]
+    assert len(buttons) == 5
+    for button in buttons:
         assert button.size["height"] >= 40, "large enough for a finger"
     view = browser.find_element("id", "view")
     assert view.size["width"] > 330

@@ -1,0 +1,192 @@
+"""Registration as a program in one file, for where there is no Python to trace it.
+
+`export_program` writes StableHLO by `jax.export`; `load_exported` runs such a file. It needs neither
+the network's code nor its weights, and traces nothing; XLA compiles it for the device at hand.
+"""
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxreg import types  # registers the records that programs return
+from jaxreg._extras import extra
+
+with extra("export", "a saved program"):
+    import flatbuffers  # noqa: F401 - jax.export needs it, and would say so at its first use
+from jax import export
+
+VERSION = 1
+"""Of the file: a zip of `card.json` and `program.bin`, the serialised `jax.export.Exported`."""
+GLOBAL = "register_global"
+"""The program that needs no weights; every other one is `register_pair` with weights of that name."""
+LEAST, MOST = 256, 2048
+"""Points of a cloud that a program with symbolic sizes takes; larger ones are matched in blocks."""
+_CARD, _PROGRAM = "card.json", "program.bin"
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportedProgram:
+    """A program from a file: call it with two clouds (n, 3) and (m, 3), as the function it was made of.
+
+    `name` is "register_global", or that of the weights. `points` are the numbers of rows (n, m) that
+    it takes: fewer are padded and masked, or, where `points` is None, any number from 256 to 2048.
+    `platforms` are those it was made for.
+    """
+
+    name: str
+    points: tuple[int, int] | None
+    platforms: tuple[str, ...]
+    _call: Callable[..., Any] = dataclasses.field(repr=False)
+
+    def __call__(
+        self,
+        source: Float[Array | np.ndarray, "n 3"],
+        reference: Float[Array | np.ndarray, "m 3"],
+        *,
+        source_mask: Bool[Array | np.ndarray, "n"] | None = None,
+        reference_mask: Bool[Array | np.ndarray, "m"] | None = None,
+    ) -> types.Registration | types.GlobalRegistration:
+        """The result of the function that was exported; float32, a row for every row of the source.
+
+        Raises:
+          ValueError: a cloud is not (n, 3), has more rows than the program takes, or its mask is not
+            (n,) of bools.
+        """
+        count = len(source)
+        sides = (("source", source, source_mask), ("reference", reference, reference_mask))
+        arrays = [
+            self._padded(name, points, mask, side)
+            for side, (name, points, mask) in enumerate(sides)
+        ]
+        (source, here), (reference, there) = arrays
+        found = self._call(source, reference, here, there)
+        return found._replace(
+            confidence=found.confidence[:count], correspondences=found.correspondences[:count]
+        )
+
+    def _padded(self, name: str, points: Any, mask: Any, side: int) -> tuple[Array, Array]:
+        points = jnp.asarray(points, jnp.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"{name} has shape {points.shape}: give one point per row, (n, 3).")
+        count = points.shape[0]
+        mask = jnp.ones(count, bool) if mask is None else jnp.asarray(mask)
+        if mask.shape != (count,) or mask.dtype != bool:
+            raise ValueError(
+                f"{name}_mask has shape {mask.shape} and dtype {mask.dtype}: give ({count},) of bools."
+            )
+        least, most = (LEAST, MOST) if self.points is None else (1, self.points[side])
+        if not least <= count <= most:
+            raise ValueError(
+                f"{name} has {count} points and this program takes {least} to {most}: thin the cloud, "
+                "or export a program for more (jaxreg export --points N M)."
+            )
+        fill = 0 if self.points is None else most - count
+        return jnp.pad(points, ((0, fill), (0, 0))), jnp.pad(mask, (0, fill))
+
+
+def export_program(
+    path: str | Path,
+    name: str = GLOBAL,
+    *,
+    points: tuple[int, int] = (1024, 1024),
+    symbolic: bool = False,
+    platforms: Sequence[str] = ("cpu",),
+) -> Path:
+    """Write a registration of two clouds as a program; `load_exported` runs it.
+
+    `name` is "register_global", or released weights or the folder of a run, with which
+    `register_pair` is written. `points` are the largest numbers of points (n, m); with `symbolic`,
+    which the search cannot do, any from 256 to 2048. `platforms` are those of JAX: cpu, cuda, rocm,
+    tpu. The file holds the weights. Returns its path.
+
+    Raises:
+      ValueError: there are no such weights or platforms, the search is asked for symbolic sizes, or
+        a size is below 16.
+    """
+    platforms = tuple(platforms)
+    if unknown := set(platforms) - {"cpu", "cuda", "rocm", "tpu"} or not platforms:
+        raise ValueError(f"platforms {unknown}: choose from cpu, cuda, rocm and tpu.")
+    if symbolic and name == GLOBAL:
+        raise ValueError(
+            f"{GLOBAL} has no program for any size: its search compares the sizes. Give --points N M; "
+            "smaller clouds are padded."
+        )
+    if not symbolic and min(points) < 16:
+        raise ValueError(f"points = {points}: a cloud needs 16 points or more.")
+    sizes = _symbols() if symbolic else points
+    clouds = [jax.ShapeDtypeStruct((size, 3), jnp.float32) for size in sizes]
+    masks = [jax.ShapeDtypeStruct((size,), jnp.bool_) for size in sizes]
+    program = export.export(jax.jit(_function(name)), platforms=platforms)(*clouds, *masks)
+    card = {
+        "version": VERSION,
+        "name": name,
+        "points": None if symbolic else list(points),
+        "platforms": list(platforms),
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(_CARD, json.dumps(card, indent=1))
+        file.writestr(_PROGRAM, bytes(program.serialize()))
+    return Path(path)
+
+
+def load_exported(path: str | Path) -> ExportedProgram:
+    """A program that `export_program` wrote; compiled at its first call.
+
+    Raises:
+      ValueError: the file is none, was written by a newer jaxreg, or is too old or too new for the
+        JAX at hand.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            card, program = json.loads(file.read(_CARD)), file.read(_PROGRAM)
+    except (zipfile.BadZipFile, KeyError, json.JSONDecodeError):
+        raise ValueError(f"{path} is no program of jaxreg: write one by jaxreg export.") from None
+    if card["version"] > VERSION:
+        raise ValueError(
+            f"{path} has version {card['version']} and this jaxreg reads up to {VERSION}: install a "
+            "newer one, or export the program again."
+        )
+    try:
+        call = jax.jit(export.deserialize(bytearray(program)).call)
+    except Exception as error:  # noqa: BLE001 - JAX raises what its parsers choose
+        raise ValueError(
+            f"{path} cannot be read by JAX {jax.__version__} ({error}): export it again."
+        ) from None
+    points = None if card["points"] is None else tuple(card["points"])
+    return ExportedProgram(card["name"], points, tuple(card["platforms"]), call)
+
+
+def _symbols() -> tuple[Any, ...]:
+    bounds = [f"{size} {bound}" for size in "nm" for bound in (f">= {LEAST}", f"<= {MOST}")]
+    return export.symbolic_shape("n, m", constraints=bounds)
+
+
+def _function(name: str) -> Callable[..., Any]:
+    if name == GLOBAL:
+        from jaxreg.search.pipeline import register_global
+
+        return lambda source, reference, source_mask, reference_mask: register_global(
+            source, reference, source_mask=source_mask, reference_mask=reference_mask
+        )
+    from jaxreg.network.model import register_pair  # Flax, which a loaded program does without
+
+    variables, config = _variables(name)
+    return lambda source, reference, source_mask, reference_mask: register_pair(
+        variables, source, reference, config=config,
+        source_mask=source_mask, reference_mask=reference_mask,
+    )  # fmt: skip
+
+
+def _variables(name: str) -> tuple[Any, Any]:
+    from jaxreg.weights.checkpoint import load_checkpoint
+    from jaxreg.weights.released import load_pretrained
+
+    return load_checkpoint(name) if (Path(name) / "best").is_dir() else load_pretrained(name)

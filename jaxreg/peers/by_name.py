@@ -1,0 +1,57 @@
+"""The network that a configuration names, the paper's or a peer: its start, its pose, its loss."""
+
+from types import ModuleType
+from typing import Any
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxreg.config import Config
+from jaxreg.network import model
+from jaxreg.network.model import Variables
+from jaxreg.peers import cemnet, dcp, idam, rpmnet
+from jaxreg.types import PointCloud, RigidTransform
+
+_PEERS: dict[str, ModuleType] = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet}
+TRAINED = ("paper", "idam", "rpmnet")
+"""The networks that `train` trains; of the others there are weights of their authors."""
+
+
+def init_variables(key: PRNGKeyArray, config: Config) -> Variables:
+    """Random initial `params` and `batch_stats`."""
+    if config.network == "paper":
+        return model.init_variables(key, config.model)
+    return _PEERS[config.network].init_variables(key, getattr(config, config.network))
+
+
+def pose(
+    variables: Variables, source: PointCloud, reference: PointCloud, *, config: Config
+) -> RigidTransform:
+    """The transform from source to reference."""
+    if config.network == "paper":
+        return model.iterate(variables, source, reference, config=config.model)[0]
+    return (
+        _PEERS[config.network]
+        .register(
+            variables,
+            source.points,
+            reference.points,
+            config=config,
+            source_mask=source.mask,
+            reference_mask=reference.mask,
+        )
+        .transform
+    )
+
+
+def loss(
+    variables: Variables,
+    source: PointCloud,
+    reference: PointCloud,
+    truth: RigidTransform,
+    *,
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]], Any]:
+    """The loss of a peer on a pair, its terms, and the variables with updated statistics."""
+    settings = getattr(config, config.network)
+    peer = _PEERS[config.network]
+    return peer.loss(variables, source, reference, truth, config=settings)

@@ -1,0 +1,94 @@
+"""What every peer does with a pair: check it on the way in, make its record on the way out."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg.config import Config
+from jaxreg.geometry import arguments, rigid
+from jaxreg.geometry.neighbors import knn, nearest_in, without_padding
+from jaxreg.types import PointCloud, Registration, RigidTransform
+
+
+def settings(config: Any, section: str, kind: type) -> Any:
+    """The settings of one peer: `config` itself, or its section of a whole configuration.
+
+    Raises:
+      ValueError: they are of another kind, or one of them is traced.
+    """
+    found = getattr(config, section) if isinstance(config, Config) else config
+    arguments.settings("config", found, kind)
+    return found
+
+
+def clouds(source: Any, reference: Any, source_mask: Any, reference_mask: Any):
+    """Both clouds with their padding at zero; one with a point that is not finite counts as empty.
+
+    Raises:
+      ValueError: a shape, a dtype or a mask is wrong.
+    """
+    source, reference = arguments.clouds(source, reference)
+    masks = (
+        arguments.usable("source_mask", source, source_mask),
+        arguments.usable("reference_mask", reference, reference_mask),
+    )
+    return tuple(
+        PointCloud(without_padding(points, mask), mask)
+        for points, mask in zip((source, reference), masks, strict=True)
+    )
+
+
+def in_dtype(variables: Any, dtype: Any) -> Any:
+    """The weights in the precision of the clouds."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), variables)
+
+
+def run(module: Any, name: str, variables: Any, *inputs: Any, train: bool) -> tuple[Any, Any]:
+    """Apply a network by its name; returns its output and `variables` with updated statistics."""
+    own = {kind: tree[name] for kind, tree in variables.items()}
+    if not train:
+        return module.apply(own, *inputs, train=False), variables
+    output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
+    statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
+    return output, variables | {"batch_stats": statistics}
+
+
+def registration(
+    transform: RigidTransform,
+    source: PointCloud,
+    reference: PointCloud,
+    confidence: Float[Array, "n"],
+    correspondences: Float[Array, "n 3"] | None = None,
+) -> Registration:
+    """The record of a pose; the identity if a cloud has no valid point.
+
+    A method without correspondences gets the reference points nearest to the moved source.
+    """
+    valid = jnp.any(source.mask) & jnp.any(reference.mask)
+    nothing = rigid.identity(source.points.dtype)
+    transform = jax.tree.map(lambda x, y: jnp.where(valid, x, y), transform, nothing)
+    if correspondences is None:
+        moved = rigid.apply(transform, source.points)
+        correspondences = reference.points[nearest_in(moved, reference.points, reference.mask)]
+    confidence = jnp.where(source.mask & valid, confidence, 0)
+    matrix = rigid.to_matrix(transform)
+    return Registration(*transform, matrix, confidence, correspondences, valid)
+
+
+def absolute_edges(cloud: PointCloud, k: int) -> Float[Array, "n k 6"]:
+    """Coordinates of the k nearest points, the point itself among them, beside those of the point."""
+    itself = jnp.arange(cloud.points.shape[0], dtype=jnp.int32)[:, None]
+    others = knn(cloud.points, k - 1, cloud.mask)
+    near = cloud.points[jnp.concatenate([itself, others], axis=1)]
+    return jnp.concatenate([near, jnp.broadcast_to(cloud.points[:, None], near.shape)], axis=-1)
+
+
+def row_softmax(scores: Float[Array, "n m"], valid: Bool[Array, "m"]) -> Float[Array, "n m"]:
+    """Softmax along the rows, over valid columns; a row of zeros if there are none."""
+    scores = jnp.where(valid[None, :], scores, -jnp.inf)
+    largest = jax.lax.stop_gradient(jnp.max(scores, axis=1, keepdims=True))
+    weight = jnp.exp(scores - jnp.where(jnp.isfinite(largest), largest, 0))
+    total = jnp.sum(weight, axis=1, keepdims=True)
+    return weight / jnp.where(total > 0, total, 1)

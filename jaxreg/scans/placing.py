@@ -1,0 +1,319 @@
+"""From registrations of pairs to the poses of many scans: which pairs to believe, and what follows.
+
+A pair is believed for its own probability and for how it agrees with others: three pairs of three scans
+that lead back to where they began are hardly right or wrong by chance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from jaxreg.graph import se3
+from jaxreg.graph.pose_graph import CHI_SQUARED, PoseGraph, squared_errors
+from jaxreg.graph.sparse import pose_covariances, solve_poses
+from jaxreg.graph.trees import components, spanning_tree, tree_poses, triangle_errors, triangles
+from jaxreg.scans.relation import Relation
+from jaxreg.types import RigidTransform
+
+SURE = 0.9
+"""A scan hangs on a pair that is right with this probability, or on several that agree."""
+_CONSIDERED = 0.02
+"""Pairs of a smaller probability are not looked at: there are many, and nearly all are wrong."""
+_MODEL = 0.3
+"""What scans of one place differ by beyond their noise (moved things, bent depth, motion of the sensor),
+in reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
+_BY_CHANCE = 1e-3
+"""How often three pairs, one of them wrong, close a triangle."""
+_CLOSED = 0.98
+"""How often three right pairs close one."""
+_ROUNDS = 4
+_LARGEST_ODDS = 12.0
+"""Log odds beyond which nothing speaks for or against a pair."""
+
+
+class Sizes(NamedTuple):
+    """Of every scan: its centre and radius, in the unit of the input."""
+
+    centre: Float[np.ndarray, "n 3"]
+    radius: Float[np.ndarray, "n"]
+
+
+class Placement(NamedTuple):
+    """Where scans are. Scans of one group are in one frame, that of its first scan.
+
+    `group` numbers the groups by size, -1 for a scan alone. `probability` is that of a scan's pose in
+    its group, `covariance` is about its own centre, in the axes of its group (NaN if alone).
+    `posterior` is the probability of each pair in view of all others, `used` says which pairs the
+    poses come from, `refusal` why the others do not count.
+    """
+
+    poses: RigidTransform
+    group: Int[np.ndarray, "n"]
+    probability: Float[np.ndarray, "n"]
+    covariance: Float[np.ndarray, "n 6 6"]
+    posterior: Float[np.ndarray, "e"]
+    used: Bool[np.ndarray, "e"]
+    refusal: tuple[str, ...]
+
+    def members(self) -> tuple[tuple[int, ...], ...]:
+        """The scans of every group, the largest group first."""
+        return tuple(
+            tuple(np.flatnonzero(self.group == k).tolist()) for k in range(self.group.max() + 1)
+        )
+
+
+def place(relations: list[Relation], sizes: Sizes) -> Placement:
+    """Believe or refuse every pair, and solve for the poses of all scans."""
+    count = len(sizes.radius)
+    graph, unit = pair_graph(relations, sizes)
+    prior = np.array([relation.probability for relation in relations], np.float64)
+    looked_at = prior >= _CONSIDERED
+    graph = graph._replace(mask=looked_at)
+    found = triangles(graph.source[looked_at], graph.reference[looked_at], count)
+    found = np.flatnonzero(looked_at)[found]
+    posterior = _posterior(prior, found, triangle_errors(graph, found))
+    poses, errors = _robust_poses(graph, posterior, count)
+    agrees = errors <= CHI_SQUARED
+    posterior = _confirmed(graph, posterior, agrees, count)
+    used = looked_at & agrees & (posterior >= SURE)
+    group = _groups(graph, used, count)
+    used &= (group[graph.source] >= 0) & (group[graph.source] == group[graph.reference])
+    first = np.array([np.flatnonzero(group == k)[0] for k in range(group.max() + 1)], np.int64)
+    fixed = group < 0
+    fixed[first] = True
+    kept = graph._replace(mask=used)
+    start = _regrounded(kept, posterior, first, count)
+    solved = solve_poses(kept, start, fixed=fixed)
+    spread = max(1.0, _excess(solved.squared_errors[used], count - int(fixed.sum())))
+    covariance = pose_covariances(kept, solved.poses, fixed=fixed) * spread
+    covariance[group < 0] = np.nan
+    return Placement(
+        _in_units(solved.poses, sizes, unit, group, first),
+        group,
+        _chances(graph, used, posterior, group, first),
+        _about_centres(covariance, solved.poses, unit),
+        posterior,
+        used,
+        tuple(_refusals(relations, used, agrees, posterior, group)),
+    )
+
+
+def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, float]:
+    """The pairs as edges between centred scans, and the unit of their lengths.
+
+    Of scans in map coordinates a rotation about the origin would move them by kilometres.
+    """
+    unit = float(np.median(sizes.radius))
+    source, reference = (
+        np.array([getattr(r, name) for r in relations], np.int64)
+        for name in ("source", "reference")
+    )
+    matrix = np.array([r.transformation for r in relations], np.float64).reshape(-1, 4, 4)
+    turn = matrix[:, :3, :3]
+    shift = se3.applied(turn, sizes.centre[source]) + matrix[:, :3, 3] - sizes.centre[reference]
+    transform = RigidTransform(turn, shift / unit)
+    covariance = np.array([r.covariance for r in relations], np.float64).reshape(-1, 6, 6)
+    covariance = np.where(np.isfinite(covariance).all(axis=(1, 2))[:, None, None], covariance, 0)
+    scaling = np.repeat([1.0, 1 / unit], 3)
+    carried = se3.adjoint(se3.inverted(transform))
+    covariance = carried @ (covariance * np.outer(scaling, scaling)) @ carried.mT
+    reach = np.array([r.max_correspondence_distance for r in relations], np.float64)
+    smaller = np.minimum(sizes.radius[source], sizes.radius[reference])
+    floor = np.stack([_MODEL * reach / smaller] * 3 + [_MODEL * reach / unit] * 3, axis=1)
+    floor = np.maximum(floor.reshape(-1, 6), 1e-6)
+    covariance = covariance + floor[:, :, None] ** 2 * np.eye(6)
+    everything = np.ones(len(source), bool)
+    return PoseGraph(source, reference, transform, np.linalg.inv(covariance), everything), unit
+
+
+def _posterior(
+    prior: Float[np.ndarray, "e"], found: Int[np.ndarray, "t 3"], error: Float[np.ndarray, "t"]
+) -> Float[np.ndarray, "e"]:
+    """The probability of every pair given which triangles close (a few rounds of belief)."""
+    start = _log_odds(prior)
+    odds = start
+    closed = error <= CHI_SQUARED
+    for _ in range(_ROUNDS):
+        chance = 1 / (1 + np.exp(-odds))
+        support, against = np.zeros_like(odds), np.zeros_like(odds)
+        for k in range(3):
+            others = chance[found[:, (k + 1) % 3]] * chance[found[:, (k + 2) % 3]]
+            right = others * _CLOSED + (1 - others) * _BY_CHANCE
+            said = np.where(closed, np.log(right / _BY_CHANCE), 0)
+            # Triangles that share pairs are no independent witnesses: the best two count.
+            np.maximum.at(support, found[:, k], said)
+            doubt = np.where(closed, 0, np.log((1 - right) / (1 - _BY_CHANCE)))
+            np.add.at(against, found[:, k], doubt)
+        # As many triangles speak against a right pair as wrong ones touch it; a wrong pair closes none.
+        against = np.maximum(against, -8.0)
+        odds = (odds + np.clip(start + support + against, -_LARGEST_ODDS, _LARGEST_ODDS)) / 2
+    return 1 / (1 + np.exp(-odds))
+
+
+def _log_odds(probability: np.ndarray) -> np.ndarray:
+    p = np.clip(probability, 1e-6, 1 - 1e-4)
+    return np.log(p / (1 - p))
+
+
+def _robust_poses(
+    graph: PoseGraph, posterior: np.ndarray, count: int
+) -> tuple[RigidTransform, np.ndarray]:
+    """Poses in which most of the probable pairs agree, and the error of every pair under them."""
+    likely = graph.mask & (posterior >= 0.5)
+    edges = np.flatnonzero(likely)
+    label = components(count, graph.source[edges], graph.reference[edges])
+    roots = np.unique(label, return_index=True)[1]
+    start = _tree(graph, edges, posterior, roots, count)
+    fixed = np.zeros(count, bool)
+    fixed[roots] = True
+    solved = solve_poses(graph._replace(mask=likely), start, fixed=fixed, robust=True)
+    errors = squared_errors(graph, solved.poses)
+    apart = label[graph.source] != label[graph.reference]
+    return solved.poses, np.where(apart | ~graph.mask, np.inf, errors)
+
+
+def _tree(graph: PoseGraph, edges, posterior, roots, count: int) -> RigidTransform:
+    cost = 1e-3 - np.log(np.clip(posterior[edges], 1e-9, 1))
+    tree = spanning_tree(count, graph.source[edges], graph.reference[edges], cost)
+    return tree_poses(count, graph, edges[tree], roots)
+
+
+def _confirmed(graph: PoseGraph, posterior, agrees, count: int) -> np.ndarray:
+    """Pairs that agree with the poses that others give are as sure as these; the rest is not.
+
+    A pair that is the only one between two parts agrees in any case, which says nothing.
+    """
+    strong = graph.mask & agrees & (posterior >= 0.5)
+    bridge = _bridges(graph, strong, count)
+    sure = agrees & graph.mask & ~bridge
+    label = components(count, graph.source[strong & ~bridge], graph.reference[strong & ~bridge])
+    inside = sure & (label[graph.source] == label[graph.reference])
+    return np.where(
+        inside,
+        np.maximum(posterior, 0.99),
+        np.where(agrees, posterior, np.minimum(posterior, 0.01)),
+    )
+
+
+def _bridges(graph: PoseGraph, edges: Bool[np.ndarray, "e"], count: int) -> Bool[np.ndarray, "e"]:
+    """Which of these edges are the only way between what lies on their two sides."""
+    adjacent: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for edge in np.flatnonzero(edges).tolist():
+        i, j = int(graph.source[edge]), int(graph.reference[edge])
+        adjacent[i].append((j, edge))
+        adjacent[j].append((i, edge))
+    order, low = [-1] * count, [0] * count
+    bridge = np.zeros(len(edges), bool)
+    visited = 0
+    for root in range(count):
+        if order[root] >= 0:
+            continue
+        order[root] = low[root] = visited
+        visited += 1
+        stack = [(root, -1, iter(adjacent[root]))]
+        while stack:
+            here, came, rest = stack[-1]
+            step = next(rest, None)
+            if step is None:
+                stack.pop()
+                if stack:
+                    parent = stack[-1][0]
+                    low[parent] = min(low[parent], low[here])
+                    bridge[came] |= low[here] > order[parent]
+                continue
+            there, edge = step
+            if edge == came:
+                continue
+            if order[there] < 0:
+                order[there] = low[there] = visited
+                visited += 1
+                stack.append((there, edge, iter(adjacent[there])))
+            else:
+                low[here] = min(low[here], order[there])
+    return bridge
+
+
+def _groups(graph: PoseGraph, used: np.ndarray, count: int) -> Int[np.ndarray, "n"]:
+    """The number of every scan's group, the largest first; -1 for scans alone."""
+    label = components(count, graph.source[used], graph.reference[used])
+    sizes = np.bincount(label)
+    order = np.argsort(-sizes, kind="stable")
+    number = np.full(len(sizes), -1)
+    number[order] = np.arange(len(sizes))
+    return np.where(sizes[label] > 1, number[label], -1)
+
+
+def _regrounded(graph: PoseGraph, posterior, first, count: int) -> RigidTransform:
+    """Poses along the best tree of the used pairs; the identity for scans alone."""
+    poses = _tree(graph, np.flatnonzero(graph.mask), posterior, first, count)
+    alone = np.isnan(poses.translation[:, 0])
+    return RigidTransform(
+        np.where(alone[:, None, None], np.eye(3), poses.rotation),
+        np.where(alone[:, None], 0.0, poses.translation),
+    )
+
+
+def _excess(errors: Float[np.ndarray, "u"], free: int) -> float:
+    """How many times larger the errors are than the covariances say; 1 if there is no redundancy."""
+    redundancy = len(errors) - free
+    return float(errors.sum() / (6 * redundancy)) if redundancy > 0 else 1.0
+
+
+def _in_units(poses: RigidTransform, sizes: Sizes, unit: float, group, first) -> RigidTransform:
+    """Poses of the scans as they were given, in the frame of the first of their group; NaN if alone."""
+    shift = unit * poses.translation - se3.applied(poses.rotation, sizes.centre)
+    given = RigidTransform(poses.rotation, shift)
+    ground = (
+        RigidTransform(*(part[first[np.maximum(group, 0)]] for part in given))
+        if len(first)
+        else given
+    )
+    rotation, translation = se3.between(ground, given)
+    alone = group < 0
+    return RigidTransform(
+        np.where(alone[:, None, None], np.nan, rotation),
+        np.where(alone[:, None], np.nan, translation),
+    )
+
+
+def _about_centres(covariance: np.ndarray, poses: RigidTransform, unit: float) -> np.ndarray:
+    """Of a motion of each scan about its centre, in the axes of the group and the unit of the input.
+
+    The frames of the first scans of groups have the axes of the groups.
+    """
+    turn = np.zeros_like(covariance)
+    turn[:, :3, :3] = poses.rotation
+    turn[:, 3:, 3:] = unit * poses.rotation
+    return turn @ covariance @ turn.mT
+
+
+def _chances(graph: PoseGraph, used, posterior, group, first) -> Float[np.ndarray, "n"]:
+    """The product of probabilities along the surest way to the first scan of the group."""
+    count = len(group)
+    if not len(first):
+        return np.zeros(count)
+    cost = 1e-9 - np.log(np.clip(posterior[used], 1e-9, 1))
+    best = spanning_tree(count, graph.source[used], graph.reference[used], cost)
+    edges = np.flatnonzero(used)[best]
+    ways = sparse.coo_matrix(
+        (cost[best], (graph.source[edges], graph.reference[edges])), shape=(count, count)
+    )
+    length = csgraph.dijkstra(ways.tocsr(), directed=False, indices=first, min_only=True)
+    return np.where(group < 0, 0.0, np.exp(-length))
+
+
+def _refusals(relations, used, agrees, posterior, group):
+    for k, relation in enumerate(relations):
+        if used[k]:
+            yield ""
+        elif not relation.success:
+            yield relation.reason
+        elif not agrees[k]:
+            yield "It contradicts pairs that agree among each other."
+        else:
+            yield (
+                f"Nothing confirms it, and alone it is not sure enough ({posterior[k]:.2f} of {SURE:g})."
+            )

@@ -1,0 +1,34 @@
+"""The peers with small networks, and random weights for them in float64."""
+
+import jax
+import numpy as np
+
+from jaxreg.config import CEMNetConfig, DCPConfig, IDAMConfig, RPMNetConfig
+from jaxreg.peers import cemnet, dcp, idam, rpmnet
+
+K = 3
+SMALL = {
+    "dcp": DCPConfig(k=K, channels=(3, 4), width=4),
+    "cemnet": CEMNetConfig(
+        k=K, channels=(3, 4), width=4, hidden=(4,), iterations=2, candidates=6, look_ahead=1,
+        epsilon=1.0, stride=2, reach=4,
+    ),
+    "idam": IDAMConfig(k=K, channels=(3, 4), hidden=4, kept_one_in=1, iterations=2),
+    "rpmnet": RPMNetConfig(
+        radius=2.0, neighbors=4, width=4, hidden=(4, 8, 4, 4), k_normals=K, sinkhorn=2,
+        iterations=2, train_iterations=2,
+    ),
+}  # fmt: skip
+MODULES = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet}
+
+
+def draw_variables(module, config, rng):
+    """Biases above zero, so that few features are cut off; variances that are positive."""
+    shapes = jax.eval_shape(lambda: module.init_variables(jax.random.key(0), config))
+
+    def draw(path, leaf):
+        place = jax.tree_util.keystr(path)
+        value = rng.normal(1.0 if "bias" in place else 0.0, 0.5, leaf.shape)
+        return 0.5 + np.abs(value) if "'var'" in place else value
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)

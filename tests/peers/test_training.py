@@ -1,0 +1,45 @@
+"""The peers that are trained here go through the same training, checkpoints and evaluation."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
+from jaxreg.evaluation import methods
+from jaxreg.peers import by_name
+from jaxreg.training import train
+from jaxreg.types import Pair, PointCloud, RigidTransform
+from jaxreg.weights.checkpoint import load_checkpoint
+from tests.peers.small import SMALL
+
+pytestmark = [pytest.mark.float32, pytest.mark.loose]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n in by_name.TRAINED if n != "paper"])
+def test_two_steps_a_checkpoint_and_a_method(name, tmp_path):
+    config = Config(
+        network=name,
+        data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
+        pairs=PairConfig(points=32, kept=24),
+        test_pairs=PairConfig(points=32, kept=24),
+        train=TrainConfig(steps=2, batch=2, validate_every=1, validation_pairs=2),
+        **{name: SMALL[name]},
+    )
+    train(config, tmp_path)
+    variables, saved = load_checkpoint(tmp_path)
+    assert saved == config
+    fresh = by_name.init_variables(jax.random.key(0), config)
+    assert jax.tree.structure(variables) == jax.tree.structure(fresh)
+    points = np.random.default_rng(0).uniform(-1, 1, (1, 24, 3)).astype(np.float32)
+    cloud = PointCloud(points, np.ones((1, 24), bool))
+    still = RigidTransform(np.eye(3)[None], np.zeros((1, 3)))
+    found = methods.choose(f"checkpoint:{tmp_path}").batch(Pair(cloud, cloud, still))
+    np.testing.assert_allclose(found.rotation[0] @ found.rotation[0].T, np.eye(3), atol=1e-5)
+
+
+def test_a_network_that_is_not_trained_here_says_so(tmp_path):
+    with pytest.raises(
+        ValueError, match="'dcp' is not trained here: .* one of paper, idam, rpmnet"
+    ):
+        train(Config(network="dcp"), tmp_path)

@@ -1,0 +1,130 @@
+"""Programs in files: against the functions that they were made of, and from a file made long ago."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxreg.data.procedural.shapes import sample_shape
+from jaxreg.geometry import rigid
+
+pytest.importorskip("flatbuffers", reason="jax.export saves programs with flatbuffers")
+
+from jaxreg import exported  # noqa: E402
+
+pytestmark = [pytest.mark.float32, pytest.mark.untyped]
+
+MADE_BEFORE = Path(__file__).parent / "exported" / "register_global_v1.jaxreg"
+"""Written on 2026-11-29 by JAX 0.10.2: jaxreg export register_global --points 128 128 --platform cpu
+cuda tpu -o FILE. Keep it as long as its version can be read."""
+
+
+def turned_pair(seed, points=120):
+    """Two samplings of a shape, the source turned and moved; and the true transform."""
+    cloud = sample_shape(seed % 50, 3, points=2 * points)
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    turn = (turn * np.sign(np.linalg.det(turn))).astype(np.float32)
+    return (cloud[:points] - 0.3) @ turn, cloud[points:] - 0.3, turn
+
+
+def test_a_file_made_before_still_registers(seed):
+    program = exported.load_exported(MADE_BEFORE)
+    assert program.platforms == ("cpu", "cuda", "tpu")
+    source, reference, turn = turned_pair(0)
+    found = program(source, reference)
+    assert found.correspondences.shape == (120, 3)
+    assert rigid.rotation_angle_deg(np.asarray(found.rotation), turn) < 8
+
+
+def test_rows_beyond_a_mask_count_for_nothing():
+    program = exported.load_exported(MADE_BEFORE)
+    source, reference, _ = turned_pair(0)
+    padded = np.concatenate([source, np.full((8, 3), np.nan, np.float32)])
+    found = program(padded, reference, source_mask=np.arange(128) < 120)
+    want = program(source, reference)
+    np.testing.assert_array_equal(found.rotation, want.rotation)
+    assert (np.asarray(found.confidence)[120:] == 0).all()
+
+
+def test_loading_and_running_needs_no_network():
+    code = f"""
+import sys
+import numpy as np
+from jaxreg import load_exported
+
+program = load_exported({str(MADE_BEFORE)!r})
+found = program(*np.random.default_rng(0).normal(size=(2, 100, 3)).astype(np.float32))
+assert found.valid
+loaded = [name for name in ("flax", "jaxreg.network", "jaxreg.search") if name in sys.modules]
+assert not loaded, loaded
+"""
+    environment = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=600, env=environment)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("symbolic", [False, True])
+def test_the_network_gives_what_it_gave_before_it_was_saved(tmp_path, seed, symbolic):
+    from jaxreg import load_pretrained, register_pair
+
+    path = exported.export_program(
+        tmp_path / "p", "modelnet40", points=(300, 300), symbolic=symbolic
+    )
+    program = exported.load_exported(path)
+    variables, config = load_pretrained("modelnet40")
+    one = jax.jit(lambda x, y: register_pair(variables, x, y, config=config))
+    for count in (300, 280):
+        source, reference, _ = turned_pair(seed, 300)
+        found, want = program(source[:count], reference), one(source[:count], reference)
+        np.testing.assert_allclose(found.rotation, want.rotation, atol=1e-3)
+        assert found.confidence.shape == (count,)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"symbolic": True}, "no program for any size.*--points"),
+        ({"platforms": ("gpu",)}, "'gpu'.*choose from cpu, cuda"),
+        ({"points": (4, 100)}, "16 points or more"),
+        ({"name": "no_such_weights"}, "no_such_weights"),
+    ],
+)
+def test_what_cannot_be_exported_is_named(tmp_path, options, told):
+    with pytest.raises(ValueError, match=told):
+        exported.export_program(tmp_path / "p", **options)
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        (np.zeros((200, 3)), "source has 200 points and this program takes 1 to 128"),
+        (np.zeros((100, 2)), r"source has shape \(100, 2\)"),
+    ],
+)
+def test_clouds_that_do_not_fit_are_named(source, told):
+    with pytest.raises(ValueError, match=told):
+        exported.load_exported(MADE_BEFORE)(source, jnp.zeros((100, 3)))
+
+
+def test_other_files_are_named(tmp_path):
+    (tmp_path / "text").write_text("no program")
+    with pytest.raises(ValueError, match="is no program of jaxreg"):
+        exported.load_exported(tmp_path / "text")
+    with zipfile.ZipFile(MADE_BEFORE) as file:
+        card, program = json.loads(file.read("card.json")), file.read("program.bin")
+    for name, version, content, told in (
+        ("newer", 99, program, "has version 99"),
+        ("cut", 1, program[:100], "cannot be read by JAX"),
+    ):
+        with zipfile.ZipFile(tmp_path / name, "w") as file:
+            file.writestr("card.json", json.dumps(card | {"version": version}))
+            file.writestr("program.bin", content)
+        with pytest.raises(ValueError, match=told):
+            exported.load_exported(tmp_path / name)
