@@ -63,7 +63,9 @@ def sequence(root: Path, name: str) -> Sequence | None:
             return None
         table = json.loads((folder / "poses.json").read_text())
         keys = sorted((k for k in table if (folder / f"scan_{k}.npz").is_file()), key=int)
-        clouds = [np.load(folder / f"scan_{k}.npz")["points"].astype(np.float64) for k in keys]
+        clouds = [
+            np.load(folder / f"scan_{k}.npz")["points"].astype(np.float64) for k in keys
+        ]
         poses = np.array([table[k] for k in keys])
         poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
         expected = np.isin(keys, _overlapping(folder))
