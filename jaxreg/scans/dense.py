@@ -92,8 +92,8 @@ def agreement(
 def at_a_glance(source: Prepared, reference: Prepared, pose: RigidTransform) -> Agreement:
     """`agreement` of few points, and of many only if these leave doubts; most pairs need no more."""
     few = agreement(source, reference, pose, count=_GLANCE)
-    enough = few.compared >= 0.9 * _ENOUGH
-    doubtful = enough and (few.off >= 0.4 * _SUSPECT or few.spread >= 0.8 * _SPREAD)
+    doubtful = few.off >= 0.4 * _SUSPECT or few.spread >= 0.95 * _SPREAD
+    doubtful = doubtful and few.compared >= 0.9 * _ENOUGH
     return agreement(source, reference, pose) if doubtful else few
 
 

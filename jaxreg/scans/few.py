@@ -31,7 +31,7 @@ from jaxreg.types import RigidTransform
 MOST = 60
 """Clouds of at most so many points are few; larger ones are surfaces."""
 _TRUSTED, _RIVAL = 0.5, 0.1
-"""The probability of a success, and that of another pose which forbids one."""
+"""The probability of a success, and that of all other poses which forbids one."""
 _FREE = 0.1
 """Standard deviation of the rotation, in radians, from which the points leave it free."""
 _REACH = 3.0
@@ -63,7 +63,7 @@ def registered(
     accuracy = _accuracy(x, best, known, reference.centre)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])
-    alone = len(chances) == 1 or bool(chances[1] < _RIVAL)
+    alone = float(chances[1:].sum()) < _RIVAL
     success = chance >= _TRUSTED and alone
     evidence = FewEvidence(
         len(best.pairs), min(len(x), len(y)), best.residual, best.log_chance / math.log(10)

@@ -98,13 +98,14 @@ def register_prepared(
     start: RigidTransform | None = None,
     known: Known | None = None,
     scale: bool = False,
+    max_rotation_deg: float | None = None,
     least: float = 0.0,
 ) -> ScanRegistration:
     """`register` of clouds that were prepared with `config`, or with another that differs in `wide`.
 
-    A pose of surfaces whose probability is below `least` after the search is left as that had it.
+    A pose whose probability is below `least` after the search is left as the search had it.
     """
-    known = known or Known()
+    known = known or Known(max_rotation_deg=max_rotation_deg or 180.0)
     if flat := planar.is_planar(source, reference):
         known = known._replace(up=planar.UP)
     if not scale:
@@ -129,8 +130,10 @@ def _of_one_size(
         return planar.registered(source, reference, config, start, known)
     if known.inside:
         return inside.registered(source, reference, config, start, (), known)
-    found = surfaces.registered(source, reference, config, start, known, least)
-    if found.success or found.probability < least or not inside.is_possible(source, reference):
+    found = surfaces.registered(source, reference, config, start, known, least=least)
+    # Who wants no wider search wants none in tiles either.
+    more = config.wide is not None or start is not None
+    if found.success or not more or not inside.is_possible(source, reference):
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))
     return inside.registered(source, reference, config, start, tried, known)

@@ -99,12 +99,16 @@ def registered(
     config: RegisterConfig,
     start: RigidTransform | None,
     known: Known,
+    *,
     least: float = 0.0,
 ) -> ScanRegistration:
-    """The registration of two scans of surfaces; see `pair.register_prepared` for `least`."""
+    """The registration of two scans of surfaces.
+
+    A pose whose probability is below `least` after the search is left as the search had it.
+    """
     problem = pose_problem(source, reference, config, known)
     if start is None:
-        return finished(problem, searched(problem), least)
+        return finished(problem, searched(problem), least=least)
     return finished(problem, Found(frame.transform_in(problem.where, start), ()))
 
 
@@ -290,11 +294,13 @@ def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
     return RigidTransform(pose.rotation, pose.translation * float(where.length))
 
 
-def finished(problem: Problem, found: Found, least: float = 0.0) -> ScanRegistration:
+def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegistration:
     """The chosen pose refined, looked at with all points, and judged beside the others."""
-    hopeless = found.probability < least
-    refined = unrefined(found.pose) if hopeless else refine_pose(problem, found.pose)
-    closing = _Closing() if hopeless else _with_all_points(problem, refined)
+    if found.probability < least:
+        refined, closing = unrefined(found.pose), _Closing()
+    else:
+        refined = refine_pose(problem, found.pose)
+        closing = _with_all_points(problem, refined)
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause
     covariance = problem.known.conditional(_covariance(refined.uncertainty, length))
@@ -305,6 +311,9 @@ def finished(problem: Problem, found: Found, least: float = 0.0) -> ScanRegistra
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
     )
     judged = jax.tree.map(lambda leaf: float(leaf[0]), evidence)
+    cause = cause or verdict.in_a_volume(
+        judged, source.fine.examined, problem.reference.fine.examined
+    )
     chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
     chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
     success = verdict.is_success(chance, chances[1:], refined.converged)

@@ -5,12 +5,18 @@ from jaxtyping import Float
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import WEIGHTS, features
+from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import WeakDirection
 
 TRUSTED = 0.5
 """Probability from which a registration counts as a success."""
 RIVAL = 0.25
 """A pose is no success if another one is right with this probability: several agree then."""
+_VOLUME = 0.185
+"""Median surface variation of points that fill a volume: 0.19 to 0.22 in a cube; surfaces have less,
+and of thin parts up to 0.19 (docs/notes/0037)."""
+_COPIED = 0.5
+"""Where so many points coincide it does not matter what they fill."""
 _LEAST_HELD = 1e-5
 """Below it the clouds leave a motion free, as planes do: no pose is the right one then."""
 _USUAL = Evidence(
@@ -31,10 +37,25 @@ def is_free(found: Evidence) -> bool:
     return bool(found.held < _LEAST_HELD)
 
 
+def fills_volume(*clouds: Examined) -> bool:
+    """Whether the points of all clouds lie on no surface, as those of crowns of trees do."""
+    return all(
+        float(np.median(np.asarray(cloud.variation)[np.asarray(cloud.mask)])) > _VOLUME
+        for cloud in clouds
+    )
+
+
 def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | None) -> bool:
     """Whether a pose is to be trusted, from its probability and those of the others."""
     alone = len(rivals) == 0 or float(np.max(rivals)) < RIVAL
     return chance >= TRUSTED and alone and converged is not False
+
+
+def in_a_volume(found: Evidence, *clouds: Examined) -> str:
+    """A sentence if the points fill a volume, where overlap alone speaks for a pose; else nothing."""
+    if found.same >= _COPIED or not fills_volume(*clouds):
+        return ""
+    return "The points fill a volume, where any pose overlaps: there is no surface to judge by."
 
 
 def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> str:
