@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
+from jaxreg.refine.config import check_options
 from jaxreg.scans import few, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
@@ -162,6 +163,8 @@ def _check_options(config: RegisterConfig) -> None:
         if not (least <= value < np.inf and value > 0):
             bound = f"at least {least}" if least else "positive"
             raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
+    if config.refine is not None:
+        check_options(config.refine)  # an error for any clouds, also where none is refined
 
 
 def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfig) -> Prepared:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def load(path: str | Path, config: RegisterConfig) -> Prepared:
             arrays["points"], arrays.get("normals"), arrays["centre"], float(arrays["radius"]),
             arrays["kept"], arrays["row"], tuple(arrays["notes"].tolist()), fine, coarse, config,
         )  # fmt: skip
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} holds no prepared scan ({error}): delete it, and it is made again."
         ) from None

@@ -77,11 +77,14 @@ def solutions(
     """
     middle = source.mean(axis=0), reference.mean(axis=0)
     x, y = source - middle[0], reference - middle[1]
+    # In a unit of their own size, volumes and areas of whatever coordinates fit into float64.
+    unit = max(float(np.abs(x).max()), float(np.abs(y).max())) or 1.0
+    x, y = x / unit, y / unit
     problem = _Problem(
         x, y, cdist(x, x), cdist(y, y), _widths(y), up, flat=up is not None and _is_flat(x, y, up)
     )
     if initial is not None:
-        shift = initial.rotation @ middle[0] + initial.translation - middle[1]
+        shift = (initial.rotation @ middle[0] + initial.translation - middle[1]) / unit
         start = RigidTransform(initial.rotation[None], shift[None])
         found = _best([_refitted(problem, start, 0.05 * problem.diameter)], problem)
     else:
@@ -89,8 +92,10 @@ def solutions(
     return [
         one._replace(
             pose=one.pose._replace(
-                translation=one.pose.translation + middle[1] - one.pose.rotation @ middle[0]
-            )
+                translation=unit * one.pose.translation + middle[1] - one.pose.rotation @ middle[0]
+            ),
+            residual=unit * one.residual,
+            squares=unit**2 * one.squares,
         )
         for one in found
     ]
@@ -118,7 +123,7 @@ class _Problem(NamedTuple):
 
 
 def _is_flat(x: np.ndarray, y: np.ndarray, up: np.ndarray) -> bool:
-    return max(np.ptp(x @ up), np.ptp(y @ up)) <= 1e-9 * max(np.ptp(x), np.ptp(y))
+    return bool(max(np.ptp(x @ up), np.ptp(y @ up)) <= 1e-9 * max(np.ptp(x), np.ptp(y)))
 
 
 def _searched(problem: _Problem, max_rotation_deg: float) -> list[Solution]:
@@ -304,7 +309,7 @@ def _log_chance(problem: _Problem, near: Float[np.ndarray, "k"]) -> Float[np.nda
 
 def _widths(points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "3"]:
     """How far the points reach along their principal axes."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    axes = np.linalg.svd(points - points.mean(axis=0))[2]
     return np.ptp(points @ axes.T, axis=0)
 
 
