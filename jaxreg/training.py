@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from jaxreg import devices
 from jaxreg._extras import extra
 from jaxreg.config import Config, TrainConfig, check_options
 from jaxreg.data import load_training, training_label
@@ -23,7 +25,7 @@ from jaxreg.evaluation.metrics import evaluate_transforms
 from jaxreg.evaluation.run import evaluate_method
 from jaxreg.geometry import rigid
 from jaxreg.io.log import read_metrics
-from jaxreg.network.features import BATCH_AXIS
+from jaxreg.network.features import BATCH_AXIS, DEVICE_AXIS
 from jaxreg.network.losses import pose_error, step_losses, total_loss
 from jaxreg.network.model import Variables, iterate
 from jaxreg.peers import by_name
@@ -145,24 +147,38 @@ def batch_loss(
     return jnp.mean(loss), (jax.tree.map(jnp.mean, terms), statistics)
 
 
-def draw_batch(step: Int[Array, ""], shapes: Float[Array, "s p 3"], config: Config) -> Pair:
-    """The pairs of a training step: random shapes, random poses and crops."""
+def draw_batch(
+    step: Int[Array, ""], shapes: Float[Array, "s p 3"], config: Config, devices: int = 1
+) -> Pair:
+    """The pairs of a training step: random shapes, random poses and crops.
+
+    Of many `devices`, under `shard_map`, each gets its share of the same pairs, and draws no others.
+    """
     stream = jax.random.fold_in(key_of(config.train.seed), _TRAIN)
     shape_key, pair_key = jax.random.split(jax.random.fold_in(stream, step))
     chosen = jax.random.randint(shape_key, (config.train.batch,), 0, shapes.shape[0])
     keys = jax.random.split(pair_key, config.train.batch)
+    if devices > 1:
+        share = config.train.batch // devices
+        first = jax.lax.axis_index(DEVICE_AXIS) * share
+        chosen, keys = (jax.lax.dynamic_slice_in_dim(x, first, share) for x in (chosen, keys))
     return jax.vmap(lambda key, shape: make_pair(key, shape, config.pairs))(keys, shapes[chosen])
 
 
 def train_step(
-    state: TrainState, shapes: Float[Array, "s p 3"], *, config: Config
+    state: TrainState, shapes: Float[Array, "s p 3"], *, config: Config, devices: int = 1
 ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
-    """One optimiser step on fresh pairs, and what to log about it."""
-    pairs = draw_batch(state.step, shapes, config)
+    """One optimiser step on fresh pairs, and what to log about it.
+
+    Under `shard_map` over `DEVICE_AXIS` each of the `devices` takes its share of the pairs.
+    """
+    pairs = draw_batch(state.step, shapes, config, devices)
     params, statistics = state.variables["params"], state.variables["batch_stats"]
     (loss, (terms, statistics)), gradient = jax.value_and_grad(batch_loss, has_aux=True)(
         params, statistics, pairs, config=config
     )
+    if devices > 1:
+        loss, terms, gradient = jax.lax.pmean((loss, terms, gradient), DEVICE_AXIS)
     updates, optimizer = create_optimizer(config.train).update(gradient, state.optimizer, params)
     variables = {"params": optax.apply_updates(params, updates), "batch_stats": statistics}
     # A young average follows faster, so it soon forgets the initial weights.
@@ -175,7 +191,17 @@ def train_step(
     ), logged
 
 
-_train_step_jit = jax.jit(train_step, static_argnames="config", donate_argnums=0)
+@functools.partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
+def _train_step_jit(state, shapes, *, config: Config, mesh: Mesh | None = None):
+    if mesh is None:
+        return train_step(state, shapes, config=config)
+    step = functools.partial(train_step, config=config, devices=mesh.size)
+    everywhere = PartitionSpec()
+    # Without its check, under which the derivatives of our own rules would have to say what they
+    # differ over; so the mean over devices is taken by hand, above.
+    return jax.shard_map(
+        step, mesh=mesh, in_specs=everywhere, out_specs=everywhere, check_vma=False
+    )(state, shapes)
 
 
 def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[str, float]:
@@ -211,13 +237,15 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     Writes `metrics.jsonl` (one object per line), the latest and the best checkpoint. The best has
     the lowest mean geodesic rotation error on the validation pairs, which are made from shapes that
     are not trained on. With `config.train.start` it fine-tunes the weights of that name or run. A run
-    that was stopped goes on from its last validation; one stopped before
-    its first validation starts over, with any configuration.
+    that was stopped goes on from its last validation, or, after SIGTERM, from where it was; one stopped
+    before its first validation starts over, with any configuration. On many devices, of this process
+    and of others (`jaxreg.devices.join_processes`), each takes a share of every batch.
 
     Raises:
-      ValueError: `config` has a number out of range, `workdir` cannot be written to, the data is
-        missing, the weights to start from do not exist or do not fit, another process trains in
-        `workdir`, or it contains a run with another configuration.
+      ValueError: `config` has a number out of range, the devices do not divide the batch,
+        `workdir` cannot be written to, the data is missing, the weights to start from do not
+        exist or do not fit, another process trains in `workdir`, or it contains a run with
+        another configuration.
       FloatingPointError: the loss is not finite; the message says at which step. Saved checkpoints
         stay.
     """
@@ -237,19 +265,22 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
         validation_points=shape_points(config.test_pairs),
         seed=config.train.seed,
     )
-    on_device = jnp.asarray(shapes)
+    mesh = devices.mesh_of_all()
+    devices.check_shares(config.train.batch, mesh)
+    on_device = devices.on_all(jnp.asarray(shapes), mesh)
     with (
         checkpoint.open_run(workdir, config) as run,
         training_progress(config.train.steps) as progress,
+        devices.watched() as watch,
     ):
         with same_streams():
             state = create_train_state(config)
-        state = run.restore(state)
+        state = run.restore(devices.on_all(state, mesh))
         if config.train.start and int(state.step) == 0:
-            state = started_from(config.train.start, state)
+            state = devices.on_all(started_from(config.train.start, state), mesh)
         while int(state.step) < config.train.steps:
             with same_streams():
-                state, logged = _train_step_jit(state, on_device, config=config)
+                state, logged = _train_step_jit(state, on_device, config=config, mesh=mesh)
             number = int(state.step)
             entry = {"step": number} | {name: float(value) for name, value in logged.items()}
             if not np.isfinite([entry["loss"], entry["gradient_norm"]]).all():
@@ -260,12 +291,15 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
                 )
             last = number == config.train.steps
             if number % config.train.validate_every == 0 or last:
-                entry |= {
-                    f"val_{k}": v for k, v in validate(state.average, held_out, config).items()
-                }
+                found = validate(devices.on_one(state.average, mesh), held_out, config)
+                entry |= {f"val_{k}": v for k, v in devices.as_first_says(found).items()}
                 run.save(number, state, entry["val_mie_r_deg"])
             run.log(entry)
             progress(entry)
+            if not last and watch.asked_to_end(number):
+                run.save(number, state, np.inf)
+                run.close()
+                watch.end(number)
     return checkpoint.load_checkpoint(workdir)[0]
 
 

@@ -13,8 +13,10 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import tyro
 
+from jaxreg import devices
 from jaxreg.cli import process
 from jaxreg.cli.options import SUCCESS, given_fields, parse, say, status_of, told
 from jaxreg.config import Config, load_config
@@ -35,6 +37,12 @@ class Options:
     release_to: str = ""
     """Directory to write them to (the workdir if left out); `jaxreg.load_pretrained` takes
     DIRECTORY/NAME, or just NAME if $JAXREG_WEIGHTS is that directory."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, if many processes train together; see also --processes, --process-id."""
+    processes: int | None = None
+    """How many processes train together; each takes a share of every batch."""
+    process_id: int | None = None
+    """The number of this process, from 0."""
     data_root: str = ""
     """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
 
@@ -68,10 +76,18 @@ def _run(options: Options, path: Path, command: str) -> int:
     workdir = options.workdir or f"runs/{path.stem}"
     place = options.release_to or workdir
     process.enable_compilation_cache()
+    devices.join_processes(options.coordinator, options.processes, options.process_id)
+    if options.release and jax.process_count() > 1:
+        raise ValueError(
+            "--release with many processes: train without it, then run the same command with it in one "
+            "process, which finds the run finished."
+        )
     if options.release:
         check_new_name(options.release, place)
     root = root_of(options.config.data, options.data_root, path)
     train(options.config, workdir, root=root)
+    if not devices.is_first():
+        return SUCCESS
     try:
         drawn = _draw_curves(workdir)
         if options.release:

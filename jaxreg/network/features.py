@@ -11,6 +11,8 @@ from jaxreg.geometry.numerics import leading_max
 
 BATCH_AXIS = "batch"
 """Name of the `vmap` axis over which BatchNorm takes its statistics while training."""
+DEVICE_AXIS = "devices"
+"""Name of the `shard_map` axis over which it takes them as well, if there is one."""
 
 
 def relative_neighbors(
@@ -73,14 +75,23 @@ def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
     # A sum over points is a product with the mask: XLA:CPU reduces long columns slowly.
     weight = jnp.broadcast_to(mask, x.shape[:-1]).reshape(-1).astype(x.dtype)
     x = x.reshape(-1, x.shape[-1])
+    axes = _axes()
 
     def over_batch(values):
-        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), BATCH_AXIS)
+        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), axes)
 
-    count = jnp.maximum(jax.lax.psum(jnp.sum(weight), BATCH_AXIS), 1)
+    count = jnp.maximum(jax.lax.psum(jnp.sum(weight), axes), 1)
     mean = over_batch(x) / count
     # Two passes: E[x^2] - E[x]^2 cancels when the inlier network sees differences near zero.
     return mean, over_batch((x - mean[None, :]) ** 2) / count
+
+
+def _axes() -> tuple[str, ...]:
+    try:
+        jax.lax.axis_index(DEVICE_AXIS)
+    except NameError:
+        return (BATCH_AXIS,)
+    return BATCH_AXIS, DEVICE_AXIS
 
 
 class DGCNN(nn.Module):

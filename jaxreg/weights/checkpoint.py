@@ -82,7 +82,9 @@ class Run:
         return state
 
     def log(self, entry: dict[str, float]) -> None:
-        """Append one object to `metrics.jsonl`."""
+        """Append one object to `metrics.jsonl`; of many processes the first does."""
+        if jax.process_index() > 0:
+            return
         with (self.directory / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
@@ -93,6 +95,8 @@ class Run:
 
     def _check_space(self, state: Any, step: int) -> None:
         """Raise OSError if there is no room for `state`: Orbax says so in hundreds of lines."""
+        if jax.process_index() > 0:
+            return
         size = sum(x.nbytes for x in jax.tree.leaves(state))
         part = self.directory / "space.part"
         try:
@@ -115,7 +119,7 @@ class Run:
     def _forget_after(self, step: int) -> None:
         """Drop logged steps that will be run again, and the incomplete line of a killed run."""
         path = self.directory / "metrics.jsonl"
-        if path.exists():
+        if path.exists() and jax.process_index() == 0:
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             kept = [line + "\n" for line in lines if _logged_step(line) <= step]
             # Replaced in one step: if killed while it writes, this run would lose the lines of the
@@ -155,7 +159,7 @@ def open_run(workdir: str | Path, config: Config) -> Iterator[Run]:
 @contextlib.contextmanager
 def _alone(directory: Path) -> Iterator[None]:
     """Hold a lock on the directory, which ends with the process, however that ends."""
-    if fcntl is None:
+    if fcntl is None or jax.process_index() > 0:
         yield
         return
     handle = os.open(directory, os.O_RDONLY)
