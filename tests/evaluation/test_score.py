@@ -154,3 +154,17 @@ def test_transforms_in_another_convention_are_told(seed):
     assert told(Rotation.random(20, random_state=seed + 1).as_matrix(), truth.translation) == ""
     assert "row vectors" in told(rotation.swapaxes(1, 2), truth.translation)
     assert "from reference to source" in told(back[:, :3, :3], back[:, :3, 3])
+
+
+@pytest.mark.parametrize(
+    ("given", "method", "message"),
+    [
+        ("idam.k", "icp", "icp is not a network"),
+        ("idam.k", "weights:modelnet40", "the weights are those of network = 'paper'"),
+        ("network", "weights:modelnet40", "trained with network = paper"),
+    ],
+)
+def test_settings_of_a_peer_have_no_effect_on_another_method(given, method, message):
+    config = from_dict({"network": "idam", "idam": {"k": 5}})
+    with pytest.raises(ValueError, match=message):
+        score.check_given(config, [given], method=method)
