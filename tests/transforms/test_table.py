@@ -36,7 +36,8 @@ ELSEWHERE = {
     "data.pairs.make_pair",
     "training.batch_loss",
 }
-"""Transformed in their own tests: graph/test_optimize.py, test_batching.py, data/test_pairs.py and test_training.py."""
+"""Transformed in their own tests: graph/test_optimize.py, test_batching.py, data/test_pairs.py and
+test_training.py."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
 """Need a package that may be missing: tests/geometry/test_rigid.py transforms them where it is."""
 HALVES = {"network.matching.gather_rows", "network.matching.collect_rows"}

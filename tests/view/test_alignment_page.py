@@ -30,7 +30,8 @@ def alignment(seed):
     covariance = np.repeat(1e-4 * np.eye(6)[None], 4, 0)
     covariance[3] = np.nan
     return Alignment(
-        rotation, translation, ((0, 1, 2),), np.array([1.0, 0.95, 0.9, 0]), covariance, np.zeros((4, 3)),
+        rotation, translation, ((0, 1, 2),), np.array([1.0, 0.95, 0.9, 0]), covariance,
+        np.zeros((4, 3)),
         (pair(1, 0), pair(2, 1), pair(2, 0, used=False), pair(3, 0, used=False, success=False)),
         ("", "", "", "No pair of it is sure."), (), (),
     )  # fmt: skip
