@@ -51,9 +51,9 @@ def join_processes(
             f"{', '.join(missing)} is missing: give all of --coordinator HOST:PORT, --processes N "
             f"and --process-id K, or set {', '.join(_VARIABLES)}."
         )
-    address, count, rank = known.values()
+    address, count, rank = map(str, known.values())
     jax.distributed.initialize(
-        str(address), int(count), int(rank), heartbeat_timeout_seconds=_HEARTBEAT_SECONDS
+        address, int(count), int(rank), heartbeat_timeout_seconds=_HEARTBEAT_SECONDS
     )
 
 

@@ -20,7 +20,8 @@ from jaxreg import types  # registers the records that programs return
 from jaxreg._extras import extra
 
 with extra("export", "a saved program"):
-    import flatbuffers  # noqa: F401 - jax.export needs it, and would say so at its first use
+    # jax.export needs it, and would say so at its first use only.
+    import flatbuffers  # noqa: F401  # pyright: ignore[reportMissingImports]
 from jax import export
 
 VERSION = 1
@@ -166,7 +167,7 @@ def load_exported(path: str | Path) -> ExportedProgram:
 
 def _symbols() -> tuple[Any, ...]:
     bounds = [f"{size} {bound}" for size in "nm" for bound in (f">= {LEAST}", f"<= {MOST}")]
-    return export.symbolic_shape("n, m", constraints=bounds)
+    return tuple(export.symbolic_shape("n, m", constraints=bounds))
 
 
 def _function(name: str) -> Callable[..., Any]:

@@ -87,7 +87,8 @@ class _Problem(NamedTuple):
         _check(graph, initial)
         start = RigidTransform(*(np.asarray(part, np.float64) for part in initial))
         graph = PoseGraph(
-            *(np.asarray(index) for index in graph[:2]),
+            np.asarray(graph.source),
+            np.asarray(graph.reference),
             RigidTransform(*(np.asarray(part, np.float64) for part in graph.transform)),
             np.asarray(graph.information, np.float64),
             np.asarray(graph.mask, bool),
@@ -245,7 +246,7 @@ def _step(where: _Structure, matrix, gradient: np.ndarray, damping: float) -> np
     return step
 
 
-def _factors(matrix: sparse.csc_matrix, damping: float) -> SuperLU:
+def _factors(matrix: sparse.csc_array, damping: float) -> SuperLU:
     diagonal = matrix.diagonal()
     # A motion that nothing determines must not make it singular.
     floor = 1e-13 * diagonal.max(initial=0)

@@ -132,12 +132,12 @@ def _padded(number: int, given: dict[str, Any]) -> _Numbered:
     sizes = [_bucket(len(cloud)) for cloud in clouds]
     # One size for both, so that few programs are compiled, unless one cloud is far larger.
     sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
-    points = [
+    source, reference = (
         np.pad(cloud, ((0, size - len(cloud)), (0, 0)))
         for cloud, size in zip(clouds, sizes, strict=True)
-    ]
-    masks = [np.pad(m, (0, size - len(m))) for m, size in zip(masks, sizes, strict=True)]
-    return _Numbered(number, len(clouds[0]), (*points, *masks))
+    )
+    here, there = (np.pad(m, (0, size - len(m))) for m, size in zip(masks, sizes, strict=True))
+    return _Numbered(number, len(clouds[0]), (source, reference, here, there))
 
 
 def _cloud(name: str, points: Any) -> np.ndarray:

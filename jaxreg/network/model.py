@@ -356,7 +356,10 @@ def register_pair(
     )
     valid = source_usable & reference_usable
     still = rigid.identity(transform.rotation.dtype)
-    transform = jax.tree.map(lambda x, y: jnp.where(valid, x, y), transform, still)
+    transform = RigidTransform(
+        jnp.where(valid, transform.rotation, still.rotation),
+        jnp.where(valid, transform.translation, still.translation),
+    )
     confidence = jnp.where(moving.mask & valid, confidence[-1], 0)
     matrix = rigid.to_matrix(transform)
     return Registration(*transform, matrix, confidence, copies[-1], valid)

@@ -20,8 +20,8 @@ def verdict(alignment: Alignment) -> str:
     if len(groups) > 1:
         sizes = " and ".join(str(len(group)) for group in groups)
         return f"{len(groups)} groups that do not hang together, of {sizes} scans"
-    least = min(float(alignment.probability[k]) for k in groups[0])
-    placed = len(groups[0])
+    group = next(iter(groups))
+    least, placed = min(float(alignment.probability[k]) for k in group), len(group)
     which = f"all {count} scans placed" if placed == count else f"{placed} of {count} scans placed"
     chance = "above 0.99" if least > 0.99 else f"{math.floor(100 * least) / 100:.2f} or more"
     return f"{which} (the probability of each is {chance})"
@@ -47,7 +47,7 @@ def figures(alignment: Alignment) -> dict[str, str]:
 def record(alignment: Alignment, names: list[str]) -> dict[str, Any]:
     """An alignment as plain values for JSON: `poses` is what ``--initial`` reads back."""
     matrices = alignment.transformation
-    placed = np.isfinite(matrices).all(axis=(1, 2))
+    placed = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     scans = [
         {
             "file": name,
@@ -94,8 +94,10 @@ def edges(alignment: Alignment) -> Edges:
     information = np.array(
         [_information(r, alignment.centres[r.reference]) for r in used], np.float64
     ).reshape(-1, 6, 6)
-    ends = ([getattr(r, name) for r in used] for name in ("source", "reference"))
-    return Edges(*(np.array(end, np.int64) for end in ends), matrices, information)
+    source, reference = (
+        np.array([getattr(r, name) for r in used], np.int64) for name in ("source", "reference")
+    )
+    return Edges(source, reference, matrices, information)
 
 
 def _information(relation: Relation, centre: np.ndarray) -> np.ndarray:

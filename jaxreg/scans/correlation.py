@@ -57,7 +57,7 @@ def placed(
     corner = low - rim
     fixed = _raster(reference.points - corner, _directions(reference.normals), cell)
     fixed = ndimage.gaussian_filter(fixed, _BLUR, mode="wrap")
-    against = np.conj(fft.fft2(fixed.astype(np.complex64), workers=-1))
+    against = np.conj(np.asarray(fft.fft2(fixed.astype(np.complex64), workers=-1)))
     count = max(8, int(2 * math.pi * rim / (_TURN * cell)))
     turns = np.arange(-count // 2, count - count // 2) * (2 * math.pi / count)
     turns = turns[np.abs(turns) <= max_turn + 1e-9]
@@ -83,7 +83,8 @@ def _raster(points: np.ndarray, values: np.ndarray, cell: float) -> Complex[np.n
     """Values summed in cells, wrapped around the sides, no cell larger than 1."""
     index = np.round(points / cell).astype(np.int64) % _GRID
     row = index[:, 0] * _GRID + index[:, 1]
-    raster = np.bincount(row, values.real, _GRID**2) + 1j * np.bincount(row, values.imag, _GRID**2)
+    raster = np.bincount(row, np.real(values), _GRID**2) + 0j
+    raster += 1j * np.bincount(row, np.imag(values), _GRID**2)
     return (raster / np.maximum(np.abs(raster), 1)).reshape(_GRID, _GRID)
 
 
@@ -99,8 +100,8 @@ def _of_turns(
         ]
     )
     # What is left is the correlation at minus the shift.
-    product = fft.fft2(rasters.astype(np.complex64), workers=-1) * against
-    agreement = fft.ifft2(product, workers=-1).real.reshape(len(turns), -1)
+    product = np.asarray(fft.fft2(rasters.astype(np.complex64), workers=-1)) * against
+    agreement = np.real(np.asarray(fft.ifft2(product, workers=-1))).reshape(len(turns), -1)
     best = np.argpartition(-agreement, _PEAKS, axis=1)[:, :_PEAKS]
     return (
         np.repeat(turns, _PEAKS),

@@ -103,9 +103,11 @@ def _view(relation: Relation, prepared: list[Prepared], unit: float) -> _View:
 def _refined(
     views: list[_View], poses: RigidTransform, fixed: Bool[np.ndarray, "n"], distance: float
 ) -> RigidTransform:
-    ends = (np.array([getattr(v, name) for v in views]) for name in ("source", "reference"))
+    first, second = (
+        np.array([getattr(v, name) for v in views]) for name in ("source", "reference")
+    )
     none = RigidTransform(np.empty((0, 3, 3)), np.empty((0, 3)))
-    graph = PoseGraph(*ends, none, np.empty((0, 6, 6)), np.ones(len(views), bool))
+    graph = PoseGraph(first, second, none, np.empty((0, 6, 6)), np.ones(len(views), bool))
     for width in _WIDTHS:
         parts = [_equations(view, poses, distance * view.reach, float(width)) for view in views]
         source, reference, coupling, slopes, other = (
@@ -119,8 +121,9 @@ def _refined(
 def _equations(view: _View, poses: RigidTransform, within: float, width: float):
     """Blocks of the normal equations of a pair, with its points paired both ways."""
     there = _between(poses, view.reference, view.source)
-    one = _one_way(*view.clouds, *view.scales, there, within, width)
-    back = _one_way(*view.clouds[::-1], *view.scales[::-1], se3.inverted(there), within, width)
+    (x, y), (a, b) = view.clouds, view.scales
+    one = _one_way(x, y, a, b, there, within, width)
+    back = _one_way(y, x, b, a, se3.inverted(there), within, width)
     return (
         one[0] + back[1], one[1] + back[0], one[2] + back[2].T, one[3] + back[4], one[4] + back[3]
     )  # fmt: skip
@@ -195,8 +198,9 @@ def _distance(views: list[_View], poses: RigidTransform) -> float:
     found = []
     for view in views:
         there = _between(poses, view.reference, view.source)
-        found += [_off(*view.clouds, *view.scales, there, view.reach)]
-        found += [_off(*view.clouds[::-1], *view.scales[::-1], se3.inverted(there), view.reach)]
+        (x, y), (a, b) = view.clouds, view.scales
+        found += [_off(x, y, a, b, there, view.reach)]
+        found += [_off(y, x, b, a, se3.inverted(there), view.reach)]
     return float(np.concatenate(found).mean())
 
 

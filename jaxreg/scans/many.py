@@ -303,8 +303,7 @@ def _alike(likeness: np.ndarray, most: int, but: set[tuple[int, int]]) -> set[tu
 
 
 def _from_starts(run: _Run, starts: list[np.ndarray | None]) -> list[Task]:
-    known = [k for k, start in enumerate(starts) if start is not None]
-    matrices = {k: starts[k] for k in known}
+    matrices = {k: start for k, start in enumerate(starts) if start is not None}
     tasks = []
     for reference, source in _overlapping(run, matrices, set()):
         start = np.linalg.inv(matrices[reference]) @ matrices[source]

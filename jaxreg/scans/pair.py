@@ -142,7 +142,7 @@ def _of_one_size(
 
 def _check_dimensions(given: tuple[object, object], clouds: tuple[Prepared, Prepared]) -> None:
     """Two columns beside three are a mistake, unless the others have one z."""
-    shapes = [np.shape(cloud) if hasattr(cloud, "__len__") else () for cloud in given]  # pyright: ignore[reportArgumentType]
+    shapes = [np.shape(cloud) if hasattr(cloud, "__len__") else () for cloud in given]  # pyright: ignore[reportArgumentType, reportCallIssue]
     flat = [len(shape) == 2 and shape[1] == 2 for shape in shapes]
     if flat[0] == flat[1] or planar.is_planar(*clouds):
         return

@@ -116,7 +116,8 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
     shift = se3.applied(turn, sizes.centre[source]) + matrix[:, :3, 3] - sizes.centre[reference]
     transform = RigidTransform(turn, shift / unit)
     covariance = np.array([r.covariance for r in relations], np.float64).reshape(-1, 6, 6)
-    covariance = np.where(np.isfinite(covariance).all(axis=(1, 2))[:, None, None], covariance, 0)
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    covariance = np.where(known[:, None, None], covariance, 0)
     scaling = np.repeat([1.0, 1 / unit], 3)
     carried = se3.adjoint(se3.inverted(transform))
     covariance = carried @ (covariance * np.outer(scaling, scaling)) @ carried.mT

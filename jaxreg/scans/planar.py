@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
@@ -166,7 +167,7 @@ def _examined(points: Float[np.ndarray, "j 3"], cloud: Prepared) -> Examined:
     pad = lambda values: np.pad(  # noqa: E731
         values.astype(np.float32), [(0, size - len(points))] + [(0, 0)] * (values.ndim - 1)
     )
-    return Examined(
+    parts = (
         pad(points),
         pad(normals),
         pad(variance[:, 0] / np.maximum(variance.sum(axis=1), 1e-300)),
@@ -175,6 +176,7 @@ def _examined(points: Float[np.ndarray, "j 3"], cloud: Prepared) -> Examined:
         np.arange(size) < len(points),
         np.float32(np.median(distance[:, min(2, count)])),
     )
+    return Examined(*(jnp.asarray(part) for part in parts))
 
 
 def _searched(
@@ -245,8 +247,9 @@ def _judged(
         np.minimum(there, len(y.judged) - 1), np.minimum(here, len(x.judged) - 1),
     )  # fmt: skip
     near = np.isfinite(y.judged_tree.query(moved, distance_upper_bound=reach / 2)[0])
+    normals = np.asarray(y.examined.normals)
     held = [
-        _held(m, y.examined.normals[t], n)
+        _held(m, normals[t], n)
         for m, t, n in zip(moved, np.minimum(there, len(y.judged) - 1), near, strict=True)
     ]
     sparse = max(0.0, 1 - 2 * min(len(x.judged), len(y.judged)) / _JUDGED)

@@ -163,7 +163,8 @@ def turn(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def _linear(source, reference, rotation, shift, size, count, flat):
     """Derivatives of the distances by rotation vector, translation and log scale; distances; over."""
     turned = size * source @ rotation.T
-    found = patches(*reference, turned + shift, count=count, flat=flat)
+    points, tree = reference
+    found = patches(points, tree, turned + shift, count=count, flat=flat)
     off, beside = offsets(turned + shift, found)
     normal = found.normal
     rows = np.column_stack(

@@ -82,8 +82,7 @@ def register_task(
 
 def register_files(task: Task, source: str, reference: str, config: RegisterConfig) -> Relation:
     """The same of two files of `stored.save`: what a worker runs."""
-    clouds = (_loaded(path, config) for path in (source, reference))
-    return register_task(task, *clouds, config)
+    return register_task(task, _loaded(source, config), _loaded(reference, config), config)
 
 
 @functools.lru_cache(_KEPT_IN_MEMORY)

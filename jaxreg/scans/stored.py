@@ -39,7 +39,7 @@ def save(cloud: Prepared, path: Path) -> None:
     if cloud.normals is not None:
         arrays["normals"] = cloud.normals
     with whole(path) as part, part.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def load(path: str | Path, config: RegisterConfig) -> Prepared:
