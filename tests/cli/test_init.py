@@ -35,7 +35,7 @@ def test_console_script_is_declared():
     assert getattr(importlib.import_module(module), function) is main
 
 
-@pytest.mark.parametrize("command", ["register", "info", "view", "train", "evaluate"])
+@pytest.mark.parametrize("command", ["register", "align", "info", "view", "train", "evaluate"])
 def test_every_command_has_help_and_takes_its_settings_as_options(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
