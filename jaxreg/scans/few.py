@@ -51,43 +51,53 @@ def registered(
     `start` is a pose of the clouds that were given; only what is near it is considered then.
     """
     clouds = source, reference
-    x, y = (cloud.points * cloud.radius for cloud in clouds)
+    # Squares of lengths of any unit might not be finite.
+    unit = max(source.radius, reference.radius)
+    x, y = (cloud.points * (cloud.radius / unit) for cloud in clouds)
     found = triples.solutions(
         x, y, up=known.up, max_rotation_deg=known.max_rotation_deg,
-        initial=None if start is None else centred(clouds, start),
+        initial=None if start is None else _scaled(centred(clouds, start), 1 / unit),
     )  # fmt: skip
     if not found or found[0].log_odds <= 0:
         return None
     best = found[0]
     chances = np.asarray(probabilities(np.array([one.log_odds for one in found])))
-    accuracy = _accuracy(x, best, known, reference.centre)
+    accuracy = _accuracy(x, best, known, reference.centre, unit)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])
     alone = float(chances[1:].sum()) < _RIVAL
     success = chance >= _TRUSTED and alone
     evidence = FewEvidence(
-        len(best.pairs), min(len(x), len(y)), best.residual, best.log_chance / math.log(10)
+        len(best.pairs), min(len(x), len(y)), unit * best.residual, best.log_chance / math.log(10)
     )
     distance = _REACH * max(best.residual, triples.EXACT * float(np.ptp(y, axis=0).max()))
     moved = x @ best.pose.rotation.T + best.pose.translation
     shared = 2 * np.sum(np.linalg.norm(moved[:, None] - y, axis=2).min(axis=1) <= distance)
     return assembled(
         clouds,
-        best.pose,
+        _scaled(best.pose, unit),
         Verdict(success, chance, "" if success else _reason(evidence, free, alone), evidence),
         accuracy,
-        distance=distance,
+        distance=unit * distance,
         overlap=float(min(shared / (len(x) + len(y)), 1.0)),
         alternatives=tuple(
-            Alternative(out_of(clouds, one.pose), float(likely))
+            Alternative(out_of(clouds, _scaled(one.pose, unit)), float(likely))
             for one, likely in zip(found[1:], chances[1:], strict=True)
             if likely >= LISTED
         ),
     )
 
 
+def _scaled(pose: RigidTransform, factor: float) -> RigidTransform:
+    return RigidTransform(pose.rotation, pose.translation * factor)
+
+
 def _accuracy(
-    x: Float[np.ndarray, "n 3"], found: Solution, known: Known, origin: Float[np.ndarray, "3"]
+    x: Float[np.ndarray, "n 3"],
+    found: Solution,
+    known: Known,
+    origin: Float[np.ndarray, "3"],
+    unit: float,
 ) -> Accuracy:
     """Covariance from the residuals of the pairs, ``s^2 (sum_i J_i^T J_i)^-1``, about the reference."""
     at = x[found.pairs[:, 0]] @ found.pose.rotation.T + found.pose.translation
@@ -100,7 +110,9 @@ def _accuracy(
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-12 * values[-1])
     covariance = basis @ (vectors / values * variance) @ vectors.T @ basis.T
-    return Accuracy(covariance, _free(at, covariance, origin), True)
+    units = np.repeat([1.0, unit], 3)
+    weak = _free(at * unit, covariance, origin)
+    return Accuracy(covariance * np.outer(units, units), weak, True)
 
 
 def _free(at: np.ndarray, covariance: np.ndarray, origin: np.ndarray) -> tuple[WeakDirection, ...]:
