@@ -22,6 +22,7 @@ WHOLE = (
     "network.losses.step_losses",
     "network.model.iterate",
     "peers.cemnet.register",
+    "peers.dcp.register",
     "peers.idam.register",
     "peers.rpmnet.register",
     "refine.methods.refine",
