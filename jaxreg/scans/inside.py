@@ -77,13 +77,13 @@ def registered(
 ) -> ScanRegistration:
     """The registration of a small scan inside a large one, judged by what the small one covers.
 
-    The poses that were `tried` come first. If none of them convinces and there is no start, the small
-    cloud is searched for in tiles of the large one.
+    The poses that were `tried` come first. If none of them convinces, there is no start and the small one
+    is known to lie inside, it is searched for in tiles of the large one, which takes seconds.
     """
     large = 1 if known.inside or reference.radius >= source.radius else 0
     pair = Nested(source, reference, large)
     judged = _judged(pair, tried if start is None else (start, *tried), config, known)
-    if start is None and _likeliest(judged) < surfaces.SURE:
+    if known.inside and start is None and _likeliest(judged) < surfaces.SURE:
         judged += _judged(pair, _found_in_tiles(pair, config, known), config, known)
     if not judged:
         return surfaces.registered(source, reference, config, start, known)

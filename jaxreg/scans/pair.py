@@ -132,9 +132,7 @@ def _of_one_size(
     if known.inside:
         return inside.registered(source, reference, config, start, (), known)
     found = surfaces.registered(source, reference, config, start, known, least=least)
-    # Who wants no wider search wants none in tiles either.
-    more = config.wide is not None or start is not None
-    if found.success or not more or not inside.is_possible(source, reference):
+    if found.success or found.probability < least or not inside.is_possible(source, reference):
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))
     return inside.registered(source, reference, config, start, tried, known)
