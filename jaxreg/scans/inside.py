@@ -77,8 +77,8 @@ def registered(
 ) -> ScanRegistration:
     """The registration of a small scan inside a large one, judged by what the small one covers.
 
-    The poses that were `tried` come first. If none of them convinces, there is no start and the small one
-    is known to lie inside, it is searched for in tiles of the large one, which takes seconds.
+    The poses that were `tried` come first. If none of them convinces, there is no start and the small
+    one is known to lie inside, it is searched for in tiles of the large one, which takes seconds.
     """
     large = 1 if known.inside or reference.radius >= source.radius else 0
     pair = Nested(source, reference, large)
