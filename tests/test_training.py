@@ -417,7 +417,7 @@ def with_section(config, section, **values):
 
 def test_training_starts_from_weights_of_the_same_network_only(config):
     state = jax.eval_shape(lambda: training.create_train_state(config))
-    with pytest.raises(ValueError, match=r"'modelnet40' do not fit .*\[model\]"):
+    with pytest.raises(ValueError, match=r"'modelnet40' do not fit .*train with network = 'paper'"):
         training.started_from("modelnet40", state)
     with pytest.raises(ValueError, match="no released weights 'none-such'"):
         training.started_from("none-such", state)
