@@ -116,7 +116,7 @@ def evaluated() -> str:
     variables = jax.eval_shape(lambda: init_variables(jax.random.key(0), CONFIG.model))
     clouds = (PointCloud(array(BATCH, n, 3), array(BATCH, n, dtype=bool)) for n in (N, M))
     pair = Pair(*clouds, RigidTransform(array(BATCH, 3, 3), array(BATCH, 3)))
-    run = functools.partial(methods._register_batch, config=CONFIG.model, padded=True)
+    run = functools.partial(methods._register_batch, config=CONFIG, padded=True)
     return compiled(jax.jit(run), variables, pair)
 
 

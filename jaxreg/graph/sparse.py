@@ -246,7 +246,7 @@ def _step(where: _Structure, matrix, gradient: np.ndarray, damping: float) -> np
     return step
 
 
-def _factors(matrix: sparse.csc_array, damping: float) -> SuperLU:
+def _factors(matrix: sparse.csc_matrix | sparse.csc_array, damping: float) -> SuperLU:
     diagonal = matrix.diagonal()
     # A motion that nothing determines must not make it singular.
     floor = 1e-13 * diagonal.max(initial=0)

@@ -5,6 +5,7 @@ where the pose is right, on the distances from the planes of the other cloud, wi
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -84,27 +85,43 @@ def _tried(
 def _fitted(
     clouds: tuple[Prepared, Prepared], pose: RigidTransform, known: Known, flat: bool
 ) -> tuple[float, RigidTransform, float]:
-    """The size and pose at which most points lie on the other surface; the size's relative sigma."""
+    """The size and pose at which most points lie on the other surface; the size's relative sigma.
+
+    A thin or curved part lies inside the plane through its points, so that the fit makes the cloud
+    whose points are taken too small. Taken both ways, the two errors cancel.
+    """
     source, reference = clouds
-    unit = reference.radius
+    found = _one_way(clouds, pose, known, flat)
+    inverse = RigidTransform(pose.rotation.T, -pose.rotation.T @ pose.translation)
+    back = _one_way((reference, source), inverse, known, flat)
+    scale = math.sqrt(found.scale / back.scale)
+    # Of the clouds as given: the centre of the source moves with its size.
+    fit = RigidTransform(found.pose.rotation, found.pose.translation * reference.radius)
+    return (
+        scale,
+        out_of((resized(source, scale), reference), fit),
+        float(np.sqrt((found.covariance[6, 6] + back.covariance[6, 6]) / 4)),
+    )
+
+
+def _one_way(
+    clouds: tuple[Prepared, Prepared], pose: RigidTransform, known: Known, flat: bool
+) -> planes.Fitted:
+    """The points of the first cloud on the planes of the second, whose radius is the unit."""
+    moving, fixed = clouds
+    unit = fixed.radius
     inner = centred(clouds, pose)
-    rows = np.linspace(0, len(source.points) - 1, min(_SAMPLE, len(source.points))).astype(int)
-    whole, count = (reference.points, reference.tree), 8 if flat else planes.NEIGHBORS
-    some = source.points[rows] * (source.radius / unit)
-    motions = np.eye(6)[:, [2, 3, 4]] if flat else known.motions
-    patches = planes.patches(*whole, reference.points[:: max(1, len(reference.points) // 2000)])
+    rows = np.linspace(0, len(moving.points) - 1, min(_SAMPLE, len(moving.points))).astype(int)
+    whole, count = (fixed.points, fixed.tree), 8 if flat else planes.NEIGHBORS
+    patches = planes.patches(*whole, fixed.points[:: max(1, len(fixed.points) // 2000)])
     narrowest = min(_CUT * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
-    found = planes.fitted(
-        some,
+    return planes.fitted(
+        moving.points[rows] * (moving.radius / unit),
         whole,
         RigidTransform(inner.rotation, inner.translation / unit),
         np.geomspace(_REACH, narrowest, _ITERATIONS),
-        motions=motions,
+        motions=np.eye(6)[:, [2, 3, 4]] if flat else known.motions,
         scale=1.0,
         count=count,
         flat=flat,
     )
-    # Of the clouds as given: the centre of the source moves with its size.
-    resized_clouds = resized(source, found.scale), reference
-    fit = RigidTransform(found.pose.rotation, found.pose.translation * unit)
-    return found.scale, out_of(resized_clouds, fit), float(np.sqrt(found.covariance[6, 6]))

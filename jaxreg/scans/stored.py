@@ -49,7 +49,7 @@ def load(path: str | Path, config: RegisterConfig) -> Prepared:
       ValueError: it is no such file.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
             arrays = dict(file)
         fine, coarse = (
             Level(arrays[name], arrays.get(f"{name}_normals"), int(arrays[f"{name}_k"]))

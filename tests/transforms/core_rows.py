@@ -107,15 +107,6 @@ def core_rows() -> dict[str, Row]:
                 (grid(), grid() * [1.0, 1.0, -1.0], np.ones(N)),
             ),
         ),
-        "geometry.procrustes.upright_procrustes": Row(
-            procrustes.upright_procrustes,
-            (points(), points(), RNG.uniform(0.5, 1, N), np.array([0.0, 0.6, 0.8])),
-            (
-                *every(lambda x: (x, x, np.ones(N), np.array([0.0, 0.6, 0.8]))),
-                (points(), points(), np.zeros(N), np.array([0.0, 0.6, 0.8])),
-                (points(), points(), np.eye(N)[2], np.array([0.0, 0.6, 0.8])),
-            ),
-        ),
         "geometry.procrustes.robust_procrustes": Row(
             functools.partial(procrustes.robust_procrustes, rounds=2),
             (points(), points(), RNG.uniform(0.5, 1, N)),
@@ -237,5 +228,20 @@ def core_rows() -> dict[str, Row]:
         "network.losses.total_loss": Row(
             functools.partial(losses.total_loss, config=LossConfig()),
             (losses.LossTerms(*RNG.uniform(size=(4, 2))),),
+        ),
+    }
+
+
+def late_rows() -> dict[str, Row]:
+    """Drawn after all others, so that these keep their inputs."""
+    return {
+        "geometry.procrustes.upright_procrustes": Row(
+            procrustes.upright_procrustes,
+            (points(), points(), RNG.uniform(0.5, 1, N), np.array([0.0, 0.6, 0.8])),
+            (
+                *every(lambda x: (x, x, np.ones(N), np.array([0.0, 0.6, 0.8]))),
+                (points(), points(), np.zeros(N), np.array([0.0, 0.6, 0.8])),
+                (points(), points(), np.eye(N)[2], np.array([0.0, 0.6, 0.8])),
+            ),
         ),
     }

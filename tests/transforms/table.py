@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from tests.transforms.core_rows import core_rows
+from tests.transforms.core_rows import core_rows, late_rows
 from tests.transforms.judge_rows import judge_rows
 from tests.transforms.network_rows import network_and_model_rows
 from tests.transforms.peer_rows import peer_rows
@@ -36,10 +36,11 @@ of their own: what `make test` leaves out, `make slow` runs."""
 TABLE = (
     core_rows()
     | network_and_model_rows()
-    | peer_rows()
     | refine_rows()
     | search_rows()
     | judge_rows()
+    | late_rows()
+    | peer_rows()
 )
 
 
