@@ -192,7 +192,7 @@ def calibration_error(entries: list[dict]) -> float:
     """Expected calibration error: sum over bins of n_b / n |mean probability - share right|."""
     rows = reliability(entries).values()
     apart = [row["pairs"] * abs(row["probability"] - row["right"]) for row in rows if row["pairs"]]
-    return sum(apart) / len(entries)
+    return float(sum(apart) / len(entries))
 
 
 def reliability(entries: list[dict]) -> dict[str, dict]:
