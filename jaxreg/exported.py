@@ -178,16 +178,10 @@ def _function(name: str) -> Callable[..., Any]:
             source, reference, source_mask=source_mask, reference_mask=reference_mask
         )
     from jaxreg.network.model import register_pair  # Flax, which a loaded program does without
+    from jaxreg.weights.released import load_network
 
-    variables, config = _variables(name)
+    variables, config = load_network(name)
     return lambda source, reference, source_mask, reference_mask: register_pair(
         variables, source, reference, config=config,
         source_mask=source_mask, reference_mask=reference_mask,
     )  # fmt: skip
-
-
-def _variables(name: str) -> tuple[Any, Any]:
-    from jaxreg.weights.checkpoint import load_checkpoint
-    from jaxreg.weights.released import load_pretrained
-
-    return load_checkpoint(name) if (Path(name) / "best").is_dir() else load_pretrained(name)

@@ -32,7 +32,7 @@ from jaxreg.peers import by_name
 from jaxreg.progress import training_progress
 from jaxreg.types import Pair, PointCloud
 from jaxreg.weights import checkpoint
-from jaxreg.weights.released import check_new_name, load_pretrained, save_weights
+from jaxreg.weights.released import check_new_name, load_network, save_weights
 
 with extra("train", "training"):
     import optax
@@ -85,8 +85,7 @@ def started_from(name: str, state: TrainState) -> TrainState:
     Raises:
       ValueError: there are none, or the network of `state` has other arrays.
     """
-    load = checkpoint.load_checkpoint if (Path(name) / "best").is_dir() else load_pretrained
-    variables, trained = load(name)
+    variables, trained = load_network(name)
     there, here = (
         {jax.tree_util.keystr(path, simple=True, separator="/"): x.shape for path, x in leaves}
         for leaves, _ in map(jax.tree_util.tree_flatten_with_path, (variables, state.variables))

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from jaxreg.cli.options import NOT_TRUSTED, SUCCESS, line, say
-from jaxreg.cli.register import OptionalPath, Output, checked_scan, patience
+from jaxreg.cli.register import OptionalPath, Output, check_picture, checked_scan, patience
 from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
@@ -116,10 +116,8 @@ def _check(command: Align) -> None:
         io.check_writable(command.output)
     if command.poses:
         io.check_poses_output(command.poses)
-    if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
     if command.plot:
-        import jaxreg.view.pictures  # noqa: F401 - matplotlib, which may be missing
+        check_picture(command.plot)
     taken = [*command.scans, *filter(None, [command.initial])]
     outputs = (command.output, command.poses, command.json, command.html, command.plot)
     for path in filter(None, outputs):

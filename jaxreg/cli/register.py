@@ -189,16 +189,21 @@ def _outputs(command: Register) -> list[Path]:
     return [p for p in (command.output, command.json, command.plot, command.html) if p]
 
 
+def check_picture(path: Path) -> None:
+    """Raise ValueError if pictures are not written in this format, ImportError without matplotlib."""
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"{path}: pictures are written as .png, .pdf or .svg: choose one.")
+    importlib.import_module("jaxreg.view.pictures")
+
+
 def _check_outputs(command: Register) -> None:
     """Refuse what cannot be written before the work, not after it."""
     from jaxreg import io
 
     if command.output:
         io.check_output(command.output, command.source)
-    if command.plot and command.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"{command.plot}: pictures are written as .png, .pdf or .svg: choose one.")
     if command.plot:
-        importlib.import_module("jaxreg.view.pictures")  # which needs matplotlib
+        check_picture(command.plot)
     taken = [command.source, command.reference, *filter(None, [command.initial])]
     for path in _outputs(command):
         io.check_place(path, taken)

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -186,6 +187,14 @@ def padded(
     rows = np.zeros((size, points.shape[1]), np.float32)
     rows[: len(points)] = points
     return rows, np.arange(size) < len(points)
+
+
+def sizes_of_pair(sizes: Sequence[int]) -> list[int]:
+    """The larger of the padded sizes of two clouds for both, unless it is far larger.
+
+    So few programs are compiled, and none takes much longer than it must.
+    """
+    return list(sizes) if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
 
 
 def padded_size(count: int, *, smallest: int) -> int:

@@ -7,10 +7,11 @@ transform per index.
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import Precision
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import arguments
 from jaxreg.types import RigidTransform
@@ -19,6 +20,12 @@ from jaxreg.types import RigidTransform
 def identity(dtype=None) -> RigidTransform:
     """The identity transform."""
     return RigidTransform(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype))
+
+
+def identity_unless(valid: Bool[Array, ""], transform: RigidTransform) -> RigidTransform:
+    """The transform, or the identity where it is not valid."""
+    still = identity(transform.rotation.dtype)
+    return jax.tree.map(lambda x, y: jnp.where(valid, x, y), transform, still)
 
 
 def apply(transform: RigidTransform, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import dtypes
 
 from jaxreg.config import Config, ModelConfig
+from jaxreg.geometry.clouds import sizes_of_pair
 from jaxreg.network.model import Variables, register_pair
 from jaxreg.types import Registration
 
@@ -129,9 +130,7 @@ def _padded(number: int, given: dict[str, Any]) -> _Numbered:
         _mask(f"{name}[{number}]", given.get(name), len(cloud))
         for name, cloud in zip(("source_masks", "reference_masks"), clouds, strict=True)
     ]
-    sizes = [_bucket(len(cloud)) for cloud in clouds]
-    # One size for both, so that few programs are compiled, unless one cloud is far larger.
-    sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
+    sizes = sizes_of_pair([_bucket(len(cloud)) for cloud in clouds])
     source, reference = (
         np.pad(cloud, ((0, size - len(cloud)), (0, 0)))
         for cloud, size in zip(clouds, sizes, strict=True)

@@ -34,9 +34,10 @@ from jaxreg.network.matching import (
     squared_feature_distance,
 )
 from jaxreg.network.matching_blocks import Branch, match_in_blocks
+from jaxreg.network.run import Variables as Variables
+from jaxreg.network.run import run_network
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
-Variables = dict[str, Any]
 _MATCHES = "matches"
 """Name of the result of the matching, which a gradient stores."""
 
@@ -118,16 +119,6 @@ def _structure(points, neighbors, config: ModelConfig):
     return geometric_structure(points, neighbors, edge=config.edge, angles=config.angles)
 
 
-def _run(module, name: str, variables: Variables, *inputs, train: bool) -> tuple[Any, Variables]:
-    """Apply a network; returns its output and `variables` with the statistics it updated."""
-    own = {kind: tree[name] for kind, tree in variables.items()}
-    if not train:
-        return module.apply(own, *inputs, train=False), variables
-    output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
-    statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
-    return output, variables | {"batch_stats": statistics}
-
-
 def point_features(
     variables: Variables,
     points: Float[Array, "n 3"],
@@ -140,7 +131,7 @@ def point_features(
     """F_P of Eq. 3 (DGCNN over `graph`) and the variables with updated statistics."""
     network, _ = _networks(config)
     edges = relative_neighbors(points, graph.neighbors)
-    return _run(network, "features", variables, edges, mask, train=train)
+    return run_network(network, "features", variables, edges, mask, train=train)
 
 
 def _both_features(variables, points, graph, mask, config, train):
@@ -263,7 +254,7 @@ def iterate(
         both = (features, reference_features)
         matches = _match(both, source_graph, reference_graph, reference, config, train)
         structures = [_structure(x, source_graph.neighbors, config) for x in (points, matches.copy)]
-        confidence, variables = _run(
+        confidence, variables = run_network(
             network, "inliers", variables, *structures, source.mask, train=train
         )
         inliers = select_inliers(confidence, config.n_inliers, source.mask)
@@ -355,11 +346,7 @@ def register_pair(
         observe=lambda step, graph: (step.confidence, step.matches.copy),
     )
     valid = source_usable & reference_usable
-    still = rigid.identity(transform.rotation.dtype)
-    transform = RigidTransform(
-        jnp.where(valid, transform.rotation, still.rotation),
-        jnp.where(valid, transform.translation, still.translation),
-    )
+    transform = rigid.identity_unless(valid, transform)
     confidence = jnp.where(moving.mask & valid, confidence[-1], 0)
     matrix = rigid.to_matrix(transform)
     return Registration(*transform, matrix, confidence, copies[-1], valid)

@@ -21,6 +21,7 @@ from jaxreg.geometry.numerics import leading_max, safe_norm
 from jaxreg.geometry.procrustes import special_procrustes
 from jaxreg.network.features import BatchNorm
 from jaxreg.network.model import Variables
+from jaxreg.network.run import run_network
 from jaxreg.peers import pair
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
@@ -191,7 +192,7 @@ def _described(variables: Variables, cloud: PointCloud, config: IDAMConfig, *, t
     itself = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)[:, None]
     neighbors = jnp.concatenate([itself, knn(cloud.points, config.k - 1, cloud.mask)], axis=1)
     inputs = cloud.points, neighbors, cloud.mask
-    features, variables = pair.run(networks["graph"], "graph", variables, *inputs, train=train)
+    features, variables = run_network(networks["graph"], "graph", variables, *inputs, train=train)
     own = {"params": variables["params"]["significance"]}
     return features, networks["significance"].apply(own, features), variables
 
@@ -216,7 +217,7 @@ def _steps(variables: Variables, source: Kept, reference: Kept, *, config, train
         moved = source.cloud._replace(points=rigid.apply(start, source.cloud.points))
         inputs = source._replace(cloud=moved), reference
         name = f"similarity_{i}"
-        (scores, validity), variables = pair.run(
+        (scores, validity), variables = run_network(
             networks[name], name, variables, *inputs, train=train
         )
         columns = jnp.argmax(jnp.where(reference.cloud.mask[None, :], scores, -jnp.inf), axis=1)

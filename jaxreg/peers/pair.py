@@ -50,16 +50,6 @@ def in_dtype(variables: Any, dtype: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), variables)
 
 
-def run(module: Any, name: str, variables: Any, *inputs: Any, train: bool) -> tuple[Any, Any]:
-    """Apply a network by its name; returns its output and `variables` with updated statistics."""
-    own = {kind: tree[name] for kind, tree in variables.items()}
-    if not train:
-        return module.apply(own, *inputs, train=False), variables
-    output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
-    statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
-    return output, variables | {"batch_stats": statistics}
-
-
 def registration(
     transform: RigidTransform,
     source: PointCloud,
@@ -72,8 +62,7 @@ def registration(
     A method without correspondences gets the reference points nearest to the moved source.
     """
     valid = jnp.any(source.mask) & jnp.any(reference.mask)
-    nothing = rigid.identity(source.points.dtype)
-    transform = jax.tree.map(lambda x, y: jnp.where(valid, x, y), transform, nothing)
+    transform = rigid.identity_unless(valid, transform)
     if correspondences is None:
         moved = rigid.apply(transform, source.points)
         correspondences = reference.points[nearest_in(moved, reference.points, reference.mask)]

@@ -15,6 +15,9 @@ from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
 from jaxreg.types import RigidTransform
 
+TURN_COST = 0.2
+"""Log odds that half a turn costs in the choice of a pose: of poses that agree equally well (a
+symmetric shape) the one that turns least is taken."""
 APART_DEG, APART = 6.0, 0.1
 """Poses nearer to each other than this (in the unit of the frame) are one and the same."""
 _REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.graph import se3
 from jaxreg.judge.odds import probabilities
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import triples
@@ -23,6 +24,7 @@ from jaxreg.scans.result import (
     Verdict,
     assembled,
     centred,
+    in_unit,
     out_of,
 )
 from jaxreg.scans.triples import Solution
@@ -56,7 +58,7 @@ def registered(
     x, y = (cloud.points * (cloud.radius / unit) for cloud in clouds)
     found = triples.solutions(
         x, y, up=known.up, max_rotation_deg=known.max_rotation_deg,
-        initial=None if start is None else _scaled(centred(clouds, start), 1 / unit),
+        initial=None if start is None else in_unit(centred(clouds, start), 1 / unit),
     )  # fmt: skip
     if not found or found[0].log_odds <= 0:
         return None
@@ -75,21 +77,17 @@ def registered(
     shared = 2 * np.sum(np.linalg.norm(moved[:, None] - y, axis=2).min(axis=1) <= distance)
     return assembled(
         clouds,
-        _scaled(best.pose, unit),
+        in_unit(best.pose, unit),
         Verdict(success, chance, "" if success else _reason(evidence, free, alone), evidence),
         accuracy,
         distance=unit * distance,
         overlap=float(min(shared / (len(x) + len(y)), 1.0)),
         alternatives=tuple(
-            Alternative(out_of(clouds, _scaled(one.pose, unit)), float(likely))
+            Alternative(out_of(clouds, in_unit(one.pose, unit)), float(likely))
             for one, likely in zip(found[1:], chances[1:], strict=True)
             if likely >= LISTED
         ),
     )
-
-
-def _scaled(pose: RigidTransform, factor: float) -> RigidTransform:
-    return RigidTransform(pose.rotation, pose.translation * factor)
 
 
 def _accuracy(
@@ -102,7 +100,7 @@ def _accuracy(
     """Covariance from the residuals of the pairs, ``s^2 (sum_i J_i^T J_i)^-1``, about the reference."""
     at = x[found.pairs[:, 0]] @ found.pose.rotation.T + found.pose.translation
     basis = known.motions
-    jacobian = np.stack([np.hstack([-_cross(p), np.eye(3)]) @ basis for p in at])
+    jacobian = np.stack([np.hstack([-se3.skew(p), np.eye(3)]) @ basis for p in at])
     information = np.einsum("pij,pik->jk", jacobian, jacobian)
     # Of each of the three coordinates of a pair, what is left once the pose has been fitted.
     left = max(3 * len(at) - basis.shape[1], 1)
@@ -122,10 +120,6 @@ def _free(at: np.ndarray, covariance: np.ndarray, origin: np.ndarray) -> tuple[W
         return ()
     axis = axes[:, -1] * np.sign(axes[np.argmax(np.abs(axes[:, -1])), -1])
     return (WeakDirection("rotation", axis, origin + at.mean(axis=0), 0.0),)
-
-
-def _cross(p: np.ndarray) -> np.ndarray:
-    return np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
 
 
 def _reason(found: FewEvidence, free: bool, alone: bool) -> str:

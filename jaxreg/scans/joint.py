@@ -69,12 +69,13 @@ def refine_jointly(
     )
     fixed = alone.copy()
     fixed[[members[0] for members in placement.members()]] = True
-    steps = []
+    steps, before = [], _distance(views, poses)
     for distance in _PASSES:
         new = _refined(views, poses, fixed, distance)
-        before, after = (_distance(views, where) for where in (poses, new))
+        after = _distance(views, new)
         steps.append(JointRefinement(distance, before * unit, after * unit, after < before))
-        poses = new if after < before else poses
+        if after < before:
+            poses, before = new, after
     shift = poses.translation * unit - se3.applied(poses.rotation, centres)
     # What is fixed keeps its pose to the last bit.
     moved = RigidTransform(

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.graph import se3
 from jaxreg.refine.uncertainty import PoseUncertainty
 from jaxreg.types import RigidTransform
 
@@ -105,7 +106,5 @@ def turns_about(
     up: Float[np.ndarray, "3"], angle: Float[np.ndarray, "b"]
 ) -> Float[np.ndarray, "b 3 3"]:
     """Rotations about a unit vector by angles in radians (Rodrigues)."""
-    x, y, z = up
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return cosine * np.eye(3) + sine * cross + (1 - cosine) * np.outer(up, up)
+    return cosine * np.eye(3) + sine * se3.skew(up) + (1 - cosine) * np.outer(up, up)

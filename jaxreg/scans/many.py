@@ -19,6 +19,7 @@ from jaxreg.scans.joint import JointRefinement, refine_jointly
 from jaxreg.scans.placing import Placement, Sizes
 from jaxreg.scans.prepare import Prepared, prepare, voxel_reduced
 from jaxreg.scans.relation import How, Relation, Task, WorkFolder, register_files, register_task
+from jaxreg.scans.result import matrix_of
 from jaxreg.types import RigidTransform
 
 _ALL_PAIRS = 8
@@ -84,7 +85,7 @@ class Alignment:
     @property
     def transformation(self) -> Float[np.ndarray, "n 4 4"]:
         """The same as 4x4 matrices."""
-        return _matrices(self.transform)
+        return matrix_of(self.transform)
 
     @property
     def success(self) -> bool:
@@ -193,7 +194,7 @@ def _checked_starts(initial: Sequence[object] | None, count: int) -> list[np.nda
             starts.append(None)
             continue
         checked = check_pose(pose, f"initial[{k}]")
-        starts.append(np.block([[checked.rotation, checked.translation[:, None]], [0, 0, 0, 1]]))
+        starts.append(matrix_of(checked))
     return starts
 
 
@@ -208,10 +209,8 @@ def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfi
     return prepare(cloud, nonfinite=nonfinite, strays=strays, config=config, name=name)
 
 
-class _Runner(NamedTuple):
-    """Runs tasks: `run` yields their results as they come, `kept` those of an earlier run first."""
-
-    run: Callable[[list[Task]], Iterator[Relation]]
+_Runner = Callable[[list[Task]], Iterator[Relation]]
+"""Runs tasks and yields their results as they come."""
 
 
 class _Run(NamedTuple):
@@ -232,7 +231,7 @@ class _Run(NamedTuple):
         """Register these pairs; the better result replaces an earlier one of the same pair."""
         done, wanted = len(self.relations), len(self.relations) + len(tasks)
         found = []
-        for k, relation in enumerate(self.runner.run(tasks)):
+        for k, relation in enumerate(self.runner(tasks)):
             found.append(relation)
             self.report(done + k + 1, wanted, text)
         # Workers finish in any order, and the order of the pairs must not change a bit.
@@ -305,7 +304,9 @@ def _alike(likeness: np.ndarray, most: int, but: set[tuple[int, int]]) -> set[tu
 def _from_starts(run: _Run, starts: list[np.ndarray | None]) -> list[Task]:
     matrices = {k: start for k, start in enumerate(starts) if start is not None}
     tasks = []
-    for reference, source in _overlapping(run, matrices, set()):
+    for (reference, source), share in proposals.overlaps(run.prepared, matrices).items():
+        if share < _OVERLAP:
+            continue
         start = np.linalg.inv(matrices[reference]) @ matrices[source]
         tasks.append(Task(source, reference, "start", start))
     return tasks
@@ -322,7 +323,7 @@ def _nearby(run: _Run, placement: Placement) -> list[Task]:
         held[[relation.source, relation.reference]] += used
         if used or relation.how == "start":
             done.add((relation.reference, relation.source))
-    matrices = _matrices(placement.poses)
+    matrices = matrix_of(placement.poses)
     tasks = []
     for members in placement.members():
         found = proposals.overlaps(run.prepared, {k: matrices[k] for k in members})
@@ -333,21 +334,6 @@ def _nearby(run: _Run, placement: Placement) -> list[Task]:
             start = np.linalg.inv(matrices[pair[0]]) @ matrices[pair[1]]
             tasks.append(Task(pair[1], pair[0], "start", start))
     return tasks
-
-
-def _matrices(poses: RigidTransform) -> np.ndarray:
-    """The poses as 4x4 matrices."""
-    matrix = np.zeros((len(poses.translation), 4, 4))
-    matrix[:, :3, :3], matrix[:, :3, 3], matrix[:, 3, 3] = *poses, 1
-    return matrix
-
-
-def _overlapping(
-    run: _Run, matrices: dict[int, np.ndarray], but: set[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """Pairs (reference, source) of scans at these poses that share some of their points."""
-    found = proposals.overlaps(run.prepared, matrices)
-    return [pair for pair, share in found.items() if share >= _OVERLAP and pair not in but]
 
 
 def _wider(run: _Run, placement: Placement, likeness: np.ndarray) -> list[Task]:
@@ -379,17 +365,17 @@ def _runner(
             path = stack.enter_context(tempfile.TemporaryDirectory(prefix="jaxreg-"))
             folder = WorkFolder(Path(path), config)
         if folder is None:
-            yield _Runner(lambda tasks: (_in_turn(task, prepared, config) for task in tasks))
+            yield lambda tasks: (_in_turn(task, prepared, config) for task in tasks)
             return
         folder.make()
         prints = [stored.fingerprint(cloud) for cloud in prepared]
         if executor is None and not workers:
-            yield _Runner(lambda tasks: _kept_or_made(tasks, prepared, folder, prints, config))
+            yield lambda tasks: _kept_or_made(tasks, prepared, folder, prints, config)
             return
-        paths = [folder.keep_scan(cloud) for cloud in prepared]
+        paths = [folder.keep_scan(*scan) for scan in zip(prepared, prints, strict=True)]
         pool = _Pool(executor, workers)
         stack.callback(pool.close)
-        yield _Runner(lambda tasks: _on_workers(tasks, pool, folder, prints, paths, config))
+        yield lambda tasks: _on_workers(tasks, pool, folder, prints, paths, config)
 
 
 def _in_turn(task: Task, prepared: list[Prepared], config: RegisterConfig) -> Relation:
@@ -400,7 +386,7 @@ def _kept_or_made(
     tasks: list[Task], prepared, folder: WorkFolder, prints: list[str], config: RegisterConfig
 ) -> Iterator[Relation]:
     for task in tasks:
-        path = folder.pair_path(task, prints[task.source], prints[task.reference])
+        path = _pair_path(folder, task, prints)
         found = folder.read(path, task)
         if found is None:
             found = _in_turn(task, prepared, config)

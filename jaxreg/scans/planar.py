@@ -31,6 +31,7 @@ from jaxreg.scans.result import (
     Verdict,
     assembled,
     centred,
+    in_unit,
     out_of,
 )
 from jaxreg.types import RigidTransform
@@ -46,16 +47,12 @@ _JUDGED = 512
 a surface of some thousands has."""
 _PLACES = 16
 """Placements that are refined and judged."""
-_TURN_COST = 0.2
-"""As in `jaxreg.scans.surfaces`."""
 _NEIGHBORS = 8
 """Points of a piece of a line."""
 _SAMPLE = 700
 """Points that a placement is refined with."""
 _NARROWING, _STEADY = 10, 6
 """Iterations while the kernel narrows, and at the end."""
-_CUT = 4.685
-"""Where Tukey's kernel ends, in standard deviations."""
 _START = 0.15
 """How far off points may lie under a pose that is given, in radii."""
 _STILL = 1e-4
@@ -76,6 +73,7 @@ class Line(NamedTuple):
     judged: Float[np.ndarray, "j 3"]
     judged_tree: cKDTree
     examined: Examined
+    noise: float
 
 
 def is_planar(source: Prepared, reference: Prepared) -> bool:
@@ -101,12 +99,12 @@ def registered(
         fits = _searched(x, y, ratio, config, known)
     else:
         inner = known.allowed(centred(clouds, start))
-        fits = [_refined(x, y, ratio, _scaled(inner, 1 / reference.radius), _START, config)]
+        fits = [_refined(x, y, ratio, in_unit(inner, 1 / reference.radius), _START, config)]
     poses = _stacked([fit.pose for fit in fits])
     evidence, score = _judged(x, y, ratio, poses)
     ranked = candidates.ranked(poses, evidence, score)
     turned = np.abs(np.arctan2(ranked.poses.rotation[:, 1, 0], ranked.poses.rotation[:, 0, 0]))
-    best = int(np.argmax(ranked.score - _TURN_COST * turned / np.pi))
+    best = int(np.argmax(ranked.score - candidates.TURN_COST * turned / np.pi))
     order = [best, *(i for i in range(len(ranked.score)) if i != best)]
     pose, *others = (
         RigidTransform(ranked.poses.rotation[i], ranked.poses.translation[i]) for i in order
@@ -126,13 +124,13 @@ def registered(
     distance = config.inlier_spacings * spacing
     return assembled(
         clouds,
-        _scaled(fit.pose, reference.radius),
+        in_unit(fit.pose, reference.radius),
         Verdict(success, chance, reason, judged),
         accuracy,
         distance=distance,
         overlap=_overlap(x, y, ratio, fit.pose, distance / reference.radius),
         alternatives=tuple(
-            Alternative(out_of(clouds, _scaled(other, reference.radius)), float(likely))
+            Alternative(out_of(clouds, in_unit(other, reference.radius)), float(likely))
             for other, likely in zip(others, rivals, strict=True)
             if likely >= LISTED
         ),
@@ -147,13 +145,15 @@ def _line(cloud: Prepared) -> Line:
     else:
         normals = cloud.fine.normals
     judged = reduce_to(points, _JUDGED)
-    return Line(points, tree, normals, judged, cKDTree(judged), _examined(judged, cloud))
+    noise = planes.patches(points, tree, judged, count=_NEIGHBORS, flat=True).noise
+    judged_tree = cKDTree(judged)
+    examined = _examined(judged, judged_tree, cloud)
+    return Line(points, tree, normals, judged, judged_tree, examined, float(np.median(noise)))
 
 
-def _examined(points: Float[np.ndarray, "j 3"], cloud: Prepared) -> Examined:
+def _examined(points: Float[np.ndarray, "j 3"], tree: cKDTree, cloud: Prepared) -> Examined:
     """A line as the judge sees a surface: padded, with normals, corners, rare directions and ends."""
     count = min(_NEIGHBORS, len(points) - 1)
-    tree = cKDTree(points)
     distance, index = tree.query(points, k=count + 1)
     spread = points[index] - points[index].mean(axis=1, keepdims=True)
     moment = np.einsum("nki,nkj->nij", spread, spread)[:, :2, :2]
@@ -201,7 +201,7 @@ def _refined(
 ) -> planes.Fitted:
     """A pose refined with some of the points, with a kernel that narrows from `reach`."""
     some = x.points[:: -(-len(x.points) // _SAMPLE)] * ratio
-    widths = np.geomspace(reach, max(_CUT * _noise(x, y, ratio), reach / 30), _NARROWING)
+    widths = np.geomspace(reach, max(planes.TUKEY * _noise(x, y, ratio), reach / 30), _NARROWING)
     return _fitted(some, y, pose, widths if config.refine else np.zeros(0))
 
 
@@ -212,7 +212,7 @@ def _closed(
     at = _fitted(x.points * ratio, y, pose, np.zeros(0))
     if config.refine is None:
         return at
-    width = _CUT * max(_noise(x, y, ratio), 1e-6)
+    width = planes.TUKEY * max(_noise(x, y, ratio), 1e-6)
     return _fitted(x.points * ratio, y, pose, np.full(_STEADY, width))
 
 
@@ -223,13 +223,7 @@ def _fitted(points: np.ndarray, y: Line, pose: RigidTransform, widths: np.ndarra
 
 
 def _noise(x: Line, y: Line, ratio: float) -> float:
-    levels = [
-        np.median(
-            planes.patches(line.points, line.tree, line.judged, count=_NEIGHBORS, flat=True).noise
-        )
-        for line in (x, y)
-    ]
-    return float(np.hypot(levels[0] * ratio, levels[1]))
+    return math.hypot(x.noise * ratio, y.noise)
 
 
 def _judged(
@@ -240,13 +234,13 @@ def _judged(
     reach = 1.0001 * REACH * max(float(line.examined.spacing) * scale for line, scale in sides)
     moved = ratio * x.judged @ np.swapaxes(poses.rotation, 1, 2) + poses.translation[:, None]
     back = (y.judged - poses.translation[:, None]) @ poses.rotation / ratio
-    there = y.judged_tree.query(moved, distance_upper_bound=reach)[1]
+    off, there = y.judged_tree.query(moved, distance_upper_bound=reach)
     here = x.judged_tree.query(back, distance_upper_bound=reach / ratio)[1]
     evidence = candidates.read(
         poses, (x.examined, y.examined), (ratio, 1.0),
         np.minimum(there, len(y.judged) - 1), np.minimum(here, len(x.judged) - 1),
     )  # fmt: skip
-    near = np.isfinite(y.judged_tree.query(moved, distance_upper_bound=reach / 2)[0])
+    near = off < reach / 2
     normals = np.asarray(y.examined.normals)
     held = [
         _held(m, normals[t], n)
@@ -303,10 +297,6 @@ def _reason(judged: Evidence, accuracy: Accuracy, rivals: float) -> str:
     if accuracy.converged is False:
         return "The pose was still moving at the end of the refinement."
     return verdict.reason(judged, (), rivals)
-
-
-def _scaled(pose: RigidTransform, factor: float) -> RigidTransform:
-    return RigidTransform(pose.rotation, pose.translation * factor)
 
 
 def _stacked(poses: list[RigidTransform]) -> RigidTransform:

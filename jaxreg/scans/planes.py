@@ -15,6 +15,8 @@ from jaxreg.types import RigidTransform
 
 NEIGHBORS = 12
 """Points of a patch of surface."""
+TUKEY = 4.685
+"""Where Tukey's kernel ends, in standard deviations, for nearly all that normal errors tell."""
 _WITHIN = 3.0
 """A point lies over its patch if it is at most this many widths from the middle, along the plane."""
 _FEWEST = 20

@@ -104,9 +104,9 @@ class WorkFolder(NamedTuple):
         for part in ("scans", "pairs"):
             (self.path / part).mkdir(parents=True, exist_ok=True)
 
-    def keep_scan(self, cloud: Prepared) -> str:
+    def keep_scan(self, cloud: Prepared, fingerprint: str) -> str:
         """Write a prepared scan unless it is there; its path."""
-        path = self.path / "scans" / f"{stored.fingerprint(cloud)}.npz"
+        path = self.path / "scans" / f"{fingerprint}.npz"
         if not path.is_file():
             stored.save(cloud, path)
         return str(path)

@@ -140,7 +140,7 @@ def assembled(
     return ScanRegistration(
         rotation=out.rotation,
         translation=out.translation,
-        transformation=np.block([[out.rotation, out.translation[:, None]], [0, 0, 0, 1]]),
+        transformation=matrix_of(out),
         confidence=source.per_input_row(
             np.maximum(0, 1 - (near / distance) ** 2) ** 2, missing=0.0
         ),
@@ -157,6 +157,18 @@ def assembled(
         **found._asdict(),
         **accuracy._asdict(),
     )
+
+
+def matrix_of(pose: RigidTransform) -> Float[np.ndarray, "*b 4 4"]:
+    """The 4x4 form of a pose in numpy, or of many."""
+    matrix = np.zeros((*pose.translation.shape[:-1], 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = *pose, 1
+    return matrix
+
+
+def in_unit(pose: RigidTransform, factor: float) -> RigidTransform:
+    """The pose of clouds whose coordinates are `factor` times as large."""
+    return RigidTransform(pose.rotation, pose.translation * factor)
 
 
 def out_of(clouds: tuple[Prepared, Prepared], pose: RigidTransform) -> RigidTransform:

@@ -10,11 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jaxreg.graph import se3
 from jaxreg.scans import planes
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
-from jaxreg.scans.result import ScanRegistration, centred, out_of, resized
+from jaxreg.scans.result import ScanRegistration, centred, in_unit, matrix_of, out_of, resized
 from jaxreg.types import RigidTransform
 
 _STEP = 1.12
@@ -25,7 +26,6 @@ _SURE = 0.9
 """No more sizes are tried at this probability."""
 _SAMPLE = 6000
 _ITERATIONS, _ROUNDS = 24, 2
-_CUT = 4.685
 _REACH = 0.1
 """How far off points may lie at the size that was tried, in radii of the reference."""
 
@@ -56,9 +56,7 @@ def registered(
     found = run(resized(source, size), reference, config, pose, known)
     return dataclasses.replace(
         found,
-        transformation=np.block(
-            [[size * found.rotation, found.translation[:, None]], [0, 0, 0, 1]]
-        ),
+        transformation=matrix_of(RigidTransform(size * found.rotation, found.translation)),
         scale=size,
         scale_sigma=size * sigma,
     )
@@ -92,11 +90,10 @@ def _fitted(
     """
     source, reference = clouds
     found = _one_way(clouds, pose, known, flat)
-    inverse = RigidTransform(pose.rotation.T, -pose.rotation.T @ pose.translation)
-    back = _one_way((reference, source), inverse, known, flat)
+    back = _one_way((reference, source), se3.inverted(pose), known, flat)
     scale = math.sqrt(found.scale / back.scale)
     # Of the clouds as given: the centre of the source moves with its size.
-    fit = RigidTransform(found.pose.rotation, found.pose.translation * reference.radius)
+    fit = in_unit(found.pose, reference.radius)
     return (
         scale,
         out_of((resized(source, scale), reference), fit),
@@ -114,7 +111,7 @@ def _one_way(
     rows = np.linspace(0, len(moving.points) - 1, min(_SAMPLE, len(moving.points))).astype(int)
     whole, count = (fixed.points, fixed.tree), 8 if flat else planes.NEIGHBORS
     patches = planes.patches(*whole, fixed.points[:: max(1, len(fixed.points) // 2000)])
-    narrowest = min(_CUT * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
+    narrowest = min(planes.TUKEY * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
     return planes.fitted(
         moving.points[rows] * (moving.radius / unit),
         whole,

@@ -23,8 +23,8 @@ _NARROWING, _STEADY, _ROUNDS = 16, 4, 3
 """Iterations while it narrows, at the end, and how often the latter are made."""
 _NEIGHBORS = 6
 """Points of a patch at the end: where the surface is curved, a smaller patch is nearer to it."""
-_CUT, _INNER = 4.685, 3.0
-"""Where Tukey's kernel ends, in standard deviations of the noise, first and last."""
+_INNER = 3.0
+"""Where Tukey's kernel ends at last, in standard deviations of the noise."""
 _AROUND = 16
 """Points around a point that tell whether the surface moved there."""
 _STAYED, _MOVED = 1.25, 2.0
@@ -71,11 +71,11 @@ def settled(
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
     given = np.ones(len(source.points)) if known.weights is None else known.weights
     noise = _noise(source, reference)
-    widths = np.geomspace(max(reach / unit, _CUT * noise), _CUT * noise, _NARROWING)
+    widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
     around = np.asarray(cKDTree(second).query(second, k=min(_AROUND, len(second)), workers=-1)[1])
     at = {"motions": motions, "count": _NEIGHBORS}
-    narrow = np.geomspace(_CUT, _INNER, _STEADY)
+    narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]
     for _ in range(_ROUNDS):
         found = planes.fitted(second, whole, found.pose, np.zeros(0), **at)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.geometry import frame
-from jaxreg.geometry.clouds import padded_size
+from jaxreg.geometry.clouds import padded_size, sizes_of_pair
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import probabilities
@@ -27,6 +27,7 @@ from jaxreg.scans.result import (
     ScanRegistration,
     Verdict,
     assembled,
+    in_unit,
 )
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.learned import load_features
@@ -35,9 +36,6 @@ from jaxreg.types import RigidTransform
 
 _SMALLEST = 512
 """Smallest size of a padded cloud in the search."""
-_TURN_COST = 0.2
-"""Log odds that half a turn costs in the choice of a pose: of poses that agree equally well (a
-symmetric shape) the one that turns least is taken."""
 SURE = 0.9
 """Probability at which the search ends, because an easy pair needs no wider one."""
 _NOTHING = Known()
@@ -142,7 +140,9 @@ def searched(problem: Problem) -> Found:
     # the others is at least an answer.
     allowed = turned <= most + 1e-3
     allowed = allowed if allowed.any() else np.ones_like(allowed)
-    best = int(np.argmax(np.where(allowed, found.score - _TURN_COST * turned / np.pi, -np.inf)))
+    best = int(
+        np.argmax(np.where(allowed, found.score - candidates.TURN_COST * turned / np.pi, -np.inf))
+    )
     poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
     others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
     return Found(
@@ -182,9 +182,9 @@ def searched_poses(
 ) -> tuple[RigidTransform, np.ndarray]:
     """The poses of the search in the pair's frame (float64), and their scores; the allowed ones."""
     where, unit, most = problem.where, problem.unit, math.radians(problem.known.max_rotation_deg)
-    sizes = [padded_size(len(level.points), smallest=_SMALLEST) for level in problem.levels]
-    # One size for both, so that few programs are compiled, unless one cloud is far larger.
-    sizes = sizes if max(sizes) > 2 * min(sizes) else 2 * [max(sizes)]
+    sizes = sizes_of_pair(
+        [padded_size(len(level.points), smallest=_SMALLEST) for level in problem.levels]
+    )
     sides = zip(problem.levels, sizes, (problem.source, problem.reference), strict=True)
     described = (
         level.described(unit / cloud.radius, size, search.radii) for level, size, cloud in sides
@@ -259,7 +259,7 @@ class _Closing(NamedTuple):
 def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
     """The last stage where parts have moved; where that is not why points disagree, the cause."""
     source, reference = problem.source, problem.reference
-    pose = _lengthened(refined.transform, problem.where)
+    pose = in_unit(refined.transform, float(problem.where.length))
     now = dense.at_a_glance(source, reference, pose)
     weights = problem.known.weights
     if weights is None and not (now.suspicious or now.drawn):
@@ -283,15 +283,11 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
         return told
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
     twin = pose_problem(mirrored, reference, config)
-    other = _lengthened(refine_pose(twin, searched(twin).pose).transform, twin.where)
+    other = refine_pose(twin, searched(twin).pose).transform
+    other = in_unit(other, float(twin.where.length))
     if dense.agreement(mirrored, reference, other).explains(now):
         return "The mirrored source fits better."
     return ""
-
-
-def _lengthened(pose: RigidTransform, where: frame.Frame) -> RigidTransform:
-    """A pose in the frame as one of the centred clouds in the unit of the input."""
-    return RigidTransform(pose.rotation, pose.translation * float(where.length))
 
 
 def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegistration:
@@ -324,7 +320,7 @@ def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegis
     reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
     return assembled(
         (source, problem.reference),
-        _lengthened(refined.transform, where),
+        in_unit(refined.transform, length),
         Verdict(success, chance, "" if success else reason, judged),
         Accuracy(covariance, weak, refined.converged),
         distance=problem.distance * length,

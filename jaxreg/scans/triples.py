@@ -77,14 +77,11 @@ def solutions(
     """
     middle = source.mean(axis=0), reference.mean(axis=0)
     x, y = source - middle[0], reference - middle[1]
-    # In a unit of their own size, volumes and areas of whatever coordinates fit into float64.
-    unit = max(float(np.abs(x).max()), float(np.abs(y).max())) or 1.0
-    x, y = x / unit, y / unit
     problem = _Problem(
         x, y, cdist(x, x), cdist(y, y), _widths(y), up, flat=up is not None and _is_flat(x, y, up)
     )
     if initial is not None:
-        shift = (initial.rotation @ middle[0] + initial.translation - middle[1]) / unit
+        shift = initial.rotation @ middle[0] + initial.translation - middle[1]
         start = RigidTransform(initial.rotation[None], shift[None])
         found = _best([_refitted(problem, start, 0.05 * problem.diameter)], problem)
     else:
@@ -92,10 +89,8 @@ def solutions(
     return [
         one._replace(
             pose=one.pose._replace(
-                translation=unit * one.pose.translation + middle[1] - one.pose.rotation @ middle[0]
-            ),
-            residual=unit * one.residual,
-            squares=unit**2 * one.squares,
+                translation=one.pose.translation + middle[1] - one.pose.rotation @ middle[0]
+            )
         )
         for one in found
     ]

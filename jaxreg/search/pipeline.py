@@ -163,14 +163,12 @@ def _registration(
     """The result in the frame and unit of the input; the identity if a cloud has no point."""
     (source, reference), (source_mask, reference_mask) = clouds, masks
     valid = jnp.any(source_mask) & jnp.any(reference_mask)
-    identity = rigid.identity(source.dtype)
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, identity)
+    pose = rigid.identity_unless(valid, pose)
     moved = rigid.apply(pose, source)
     nearest = nearest_packed(moved, reference, reference_mask)
     squared = jnp.sum((moved - reference[nearest]) ** 2, axis=-1)
     trust = jnp.where(source_mask & valid, jnp.exp(-squared / (2 * NEAR_WIDTH**2)), 0)
     correspondences = reference[nearest] * where.length + where.reference_centre[None, :]
-    pose = frame.transform_out(where, pose)
-    pose = jax.tree.map(lambda p, i: jnp.where(valid, p, i), pose, identity)
+    pose = rigid.identity_unless(valid, frame.transform_out(where, pose))
     matrix = rigid.to_matrix(pose)
     return GlobalRegistration(*pose, matrix, trust, correspondences, score, valid)

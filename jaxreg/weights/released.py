@@ -53,6 +53,19 @@ def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:
     return _nested(arrays), configuration.from_dict(card["config"], where=f"{name}.json")
 
 
+def load_network(name: str) -> tuple[dict[str, Any], Config]:
+    """`load_pretrained`, or the best weights of a run if `name` is its folder.
+
+    Raises:
+      ValueError: there are no such weights or no such checkpoint, or they are damaged.
+    """
+    if (Path(name) / "best").is_dir():
+        from jaxreg.weights.checkpoint import load_checkpoint  # needs the extra `train`
+
+        return load_checkpoint(name)
+    return load_pretrained(name)
+
+
 def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays by name, as they were saved, and the card.
 

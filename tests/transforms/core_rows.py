@@ -244,4 +244,7 @@ def late_rows() -> dict[str, Row]:
                 (points(), points(), np.eye(N)[2], np.array([0.0, 0.6, 0.8])),
             ),
         ),
+        "geometry.rigid.identity_unless": Row(
+            rigid.identity_unless, (np.array(True), pose()), ((np.array(False), nowhere()),)
+        ),
     }

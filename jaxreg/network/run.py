@@ -1,0 +1,17 @@
+"""One of the networks of a method, applied with its own part of the variables."""
+
+from typing import Any
+
+Variables = dict[str, Any]
+
+
+def run_network(
+    module: Any, name: str, variables: Variables, *inputs: Any, train: bool
+) -> tuple[Any, Variables]:
+    """Apply a network; returns its output and `variables` with the statistics it updated."""
+    own = {kind: tree[name] for kind, tree in variables.items()}
+    if not train:
+        return module.apply(own, *inputs, train=False), variables
+    output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
+    statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
+    return output, variables | {"batch_stats": statistics}
