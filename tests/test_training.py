@@ -53,6 +53,9 @@ def loss_of(config: Config):
     return jax.jit(functools.partial(training.batch_loss, config=config))
 
 
+draw_batch = jax.jit(training.draw_batch, static_argnums=2)
+
+
 @functools.cache
 def gradient_of(config: Config):
     return jax.jit(jax.grad(functools.partial(training.batch_loss, config=config), has_aux=True))
@@ -61,7 +64,7 @@ def gradient_of(config: Config):
 @pytest.mark.slow
 def test_the_true_transform_changes_no_gradient(config, seed):
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
-    pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
+    pairs = draw_batch(jnp.zeros((), jnp.int32), shapes, config)
     lie = RigidTransform(*jax.tree.map(lambda x: x * 0 + seed + 7.0, pairs.transform))
     state = training.create_train_state(config)
     arguments = state.variables["params"], state.variables["batch_stats"]
@@ -74,7 +77,7 @@ def test_the_true_transform_changes_no_gradient(config, seed):
 def test_the_pose_loss_reads_the_true_transform_and_nothing_else_changes(config, seed):
     posed = dataclasses.replace(config, loss=dataclasses.replace(config.loss, pose=2.0))
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
-    pairs = training.draw_batch(jnp.zeros((), jnp.int32), shapes, config)
+    pairs = draw_batch(jnp.zeros((), jnp.int32), shapes, config)
     state = training.create_train_state(config)
     arguments = state.variables["params"], state.variables["batch_stats"], pairs
     loss, (terms, _) = loss_of(config)(*arguments)
@@ -95,7 +98,7 @@ def test_a_step_lowers_the_loss_on_its_own_pairs(config, seed):
     """A law of gradients: a short enough step along minus the gradient lowers the loss."""
     shapes = jax.random.normal(jax.random.key(seed), (2, 32, 3))
     state = training.create_train_state(config)
-    pairs = training.draw_batch(state.step, shapes, config)
+    pairs = draw_batch(state.step, shapes, config)
     params, statistics = state.variables["params"], state.variables["batch_stats"]
     loss = loss_of(config)
     gradient, _ = gradient_of(config)(params, statistics, pairs)

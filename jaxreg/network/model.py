@@ -4,6 +4,7 @@
 and `inliers`. Everything here is a pure function of one pair; use `vmap` for a batch.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -89,6 +90,7 @@ def neighborhood_graph(cloud: PointCloud, config: ModelConfig, *, own: bool | No
     return Graph(neighbors, matching, nearest, nested)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init_variables(key: PRNGKeyArray, config: ModelConfig) -> Variables:
     """Random initial `params` and `batch_stats` for the network of `config`."""
     features, inliers = _networks(config)

@@ -30,7 +30,8 @@ _AROUND = 16
 _STAYED, _MOVED = 1.25, 2.0
 """Where their median distance is so many times that of the noise, it did not, or it did."""
 _GAIN = 1.02
-"""A pose is taken if so many times as many points agree with it."""
+"""A pose is taken if so many times as many points agree with it: lie within one noise level. Within
+three a pose that was drawn along a little agrees about as well as the right one."""
 _LEAST = 1e-9
 
 
@@ -84,7 +85,7 @@ def settled(
         found = planes.fitted(second, whole, found.pose, noise * narrow, weights=stays, **at)
     wider = planes.fitted(second, whole, found.pose, 1.5 * noise * narrow[-1:], weights=stays, **at)
     before = planes.fitted(second, whole, start, np.zeros(0), **at)
-    agree, agreed = (np.sum(one.over & (np.abs(one.off) < 3 * noise)) for one in (found, before))
+    agree, agreed = (np.sum(one.over & (np.abs(one.off) < noise)) for one in (found, before))
     # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
     drawn = _difference(wider.pose, found.pose)
     covariance = found.covariance[:6, :6] + np.outer(drawn, drawn)

@@ -337,8 +337,8 @@ def test_same_key_same_bits_and_vmap_is_a_loop(config, seed):
     again = jax.jit(jax.vmap(lambda key, one: make_pair(key, one, config)))(keys, shape)
     for one, other in zip(jax.tree.leaves(batch), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
-    for i, make in enumerate((drawn_pair, drawn_pair, make_pair)):
-        single = make(keys[i], shape[i], config)
+    for i in range(3):
+        single = drawn_pair(keys[i], shape[i], config)
         for one, other in zip(jax.tree.leaves(batch), jax.tree.leaves(single), strict=True):
             np.testing.assert_allclose(one[i], other, atol=1e-6)
     assert np.abs(batch.transform.translation[0] - batch.transform.translation[1]).max() > 1e-3

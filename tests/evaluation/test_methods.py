@@ -45,7 +45,7 @@ def angle_deg(found, truth):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[pytest.mark.slow] * (n == "register_global_learned")) for n in NAMES],
+    [pytest.param(n, marks=[pytest.mark.slow] * n.startswith("register_global")) for n in NAMES],
 )
 def test_every_name_is_a_method_of_a_batch_and_of_two_clouds(name, pair):
     method = chosen(name)

@@ -154,17 +154,17 @@ def degenerate_clouds(n=24):
 
 @gicp_first
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("offset", [0.0, 0.01])
-def test_finite_at_degenerate_clouds(method, dtype, offset):
+def test_finite_at_degenerate_clouds(method, dtype):
     clouds = degenerate_clouds().astype(dtype)
     options = {"config": RefineConfig(iterations=5)}
 
-    def solve(cloud):
+    def solve(cloud, offset):
         pose = METHODS[method](cloud, cloud + offset, **options)
         arguments = (METHODS[method], cloud, cloud + offset)
         return pose, jax.grad(pose_sum, (1, 2))(*arguments, **options)
 
-    pose, gradients = jax.jit(jax.vmap(solve))(clouds)
+    both_offsets = jnp.repeat(jnp.array([0.0, 0.01], dtype), len(clouds))
+    pose, gradients = jax.jit(jax.vmap(solve))(jnp.concatenate([clouds, clouds]), both_offsets)
     np.testing.assert_allclose(np.linalg.det(pose.rotation), 1, atol=1e-5)
     assert np.isfinite(pose.translation).all()
     assert np.abs(pose.translation).max() < 1
@@ -192,9 +192,11 @@ def test_padding_changes_nothing(method, seed):
         jnp.concatenate([jnp.full((9, 3), jnp.nan), y]),
     )
     masks = {"source_mask": jnp.arange(47) < 40, "reference_mask": jnp.arange(59) >= 9}
-    differentiate = jax.value_and_grad(pose_sum, (1, 2))
-    value, gradient = differentiate(METHODS[method], x, y, **options)
-    padded_value, padded_gradient = differentiate(METHODS[method], *padded, **options, **masks)
+    differentiate = jax.jit(
+        jax.value_and_grad(partial(pose_sum, METHODS[method], **options), (0, 1))
+    )
+    value, gradient = differentiate(x, y)
+    padded_value, padded_gradient = differentiate(*padded, **masks)
     np.testing.assert_allclose(padded_value, value, rtol=1e-9)
     np.testing.assert_allclose(padded_gradient[0][:40], gradient[0], atol=1e-7)
     np.testing.assert_allclose(padded_gradient[1][9:], gradient[1], atol=1e-7)
