@@ -57,6 +57,30 @@ def join_processes(
     )
 
 
+def place_of(number: int | None, processes: int | None) -> tuple[int, int]:
+    """The number of this process and how many there are, where they need not know each other.
+
+    What is not given is read from JAX_PROCESS_ID and JAX_NUM_PROCESSES, or SLURM's variables; else
+    there is one process.
+
+    Raises:
+      ValueError: one of the two is known and the other is not.
+    """
+    known = [
+        os.environ.get(variable, os.environ.get(slurm)) if value is None else value
+        for value, variable, slurm in (
+            (number, "JAX_PROCESS_ID", "SLURM_PROCID"),
+            (processes, "JAX_NUM_PROCESSES", "SLURM_NTASKS"),
+        )
+    ]
+    if None in known and known != [None, None]:
+        raise ValueError(
+            "one of --processes N and --process-id K is missing: give both, or set "
+            "JAX_NUM_PROCESSES and JAX_PROCESS_ID."
+        )
+    return (0, 1) if None in known else (int(str(known[0])), int(str(known[1])))
+
+
 def mesh_of_all() -> Mesh | None:
     """All devices of all processes in one line; None if there is only one."""
     if jax.device_count() == 1:

@@ -88,7 +88,7 @@ def shared(root: Path | None, pairs: int = 64) -> float:
     """The share of the source's points that the reference has too, of the unseen objects."""
     config = load_config(CONFIGS / "modelnet40_unseen_objects.toml")
     shares = []
-    for batch, count in score.pair_stream(config, root=root, pairs=pairs)[1]:
+    for batch, count in score.pair_stream(config, root=root, pairs=pairs).batches():
         for i in range(count):
             source, reference = (np.asarray(x.points[i])[np.asarray(x.mask[i])] for x in batch[:2])
             rotation, translation = (np.asarray(x[i]) for x in batch.transform)

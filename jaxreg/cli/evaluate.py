@@ -16,12 +16,13 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from jaxreg import io
+from jaxreg import devices, io
 from jaxreg.cli import process
 from jaxreg.cli.options import SUCCESS, given_fields, parse, say, status_of
 from jaxreg.config import Config
 from jaxreg.data import root_of
 from jaxreg.evaluation import methods, score
+from jaxreg.evaluation.parts import Parts
 from jaxreg.evaluation.table import results_table
 
 _SUFFIXES = {
@@ -55,6 +56,14 @@ class Options:
     """Evaluate only the first N pairs; 0 means all."""
     batch: int = 8
     """Pairs per batch."""
+    parts: str = ""
+    """Keep every batch in this folder as soon as it is registered: the same command goes on after an
+    interruption, and many processes may share it (see --processes)."""
+    processes: int | None = None
+    """How many processes share the folder of --parts, each started with this command; the last one to
+    end prints the table. Else JAX_NUM_PROCESSES or SLURM_NTASKS say it, if they are set."""
+    process_id: int | None = None
+    """The number of this process, from 0 (else JAX_PROCESS_ID or SLURM_PROCID)."""
     json: str = ""
     """Write the results to this file."""
     picture: str = ""
@@ -90,13 +99,29 @@ def _run(options: Options, path: Path, given: Collection[str]) -> int:
         refine=options.refine,
         pairs=options.pairs,
         batch=options.batch,
+        parts=_parts(options),
     )
+    if scored is None:
+        say(
+            f"the batches of this process are in {options.parts}; those of others are still missing"
+        )
+        return SUCCESS
     # Written even if the other fails, for a bad pose or a full disk: they hold minutes of work.
     try:
         _report(options, path, scored)
     finally:
         _write(options, config, root, scored)
     return SUCCESS
+
+
+def _parts(options: Options) -> Parts | None:
+    """The share of this process, or None if there is one process and no folder."""
+    number, processes = devices.place_of(options.process_id, options.processes)
+    if options.parts:
+        return Parts(Path(options.parts), number, processes)
+    if options.processes is not None or options.process_id is not None:
+        raise ValueError("--processes and --process-id need a folder that all share: give --parts.")
+    return None
 
 
 def _method(options: Options) -> str:
@@ -113,6 +138,8 @@ def _method(options: Options) -> str:
 
 def _check(options: Options, path: Path) -> None:
     """Refuse what cannot be done before the work, not after it."""
+    if options.parts and options.transforms and not options.refine:
+        raise ValueError("--parts has no effect with --transforms: there is nothing to register.")
     if options.pairs < 0 or options.batch < 1:
         raise ValueError(
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
@@ -168,7 +195,7 @@ def _write(options: Options, config: Config, root: Path | None, scored: score.Sc
     if options.save_transforms:
         score.save_transforms(options.save_transforms, scored.predicted)
     if options.save_pairs:
-        _, batches = score.pair_stream(config, root=root, pairs=options.pairs)
-        score.save_pairs(options.save_pairs, batches)
+        stream = score.pair_stream(config, root=root, pairs=options.pairs)
+        score.save_pairs(options.save_pairs, stream.batches())
     if options.picture:
         score.draw_first_pair(options.picture, scored)

@@ -1,6 +1,6 @@
 """Streams of pairs in batches of equal size: made from shapes, or given by a data set."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 
 import jax
@@ -45,18 +45,28 @@ _make_batch_jit = jax.jit(_make_batch, static_argnames="config")
 
 
 def pair_batches(
-    shapes: Float[np.ndarray, "s p 3"], key: PRNGKeyArray, *, config: PairConfig, batch: int
+    shapes: Float[np.ndarray, "s p 3"],
+    key: PRNGKeyArray,
+    *,
+    config: PairConfig,
+    batch: int,
+    only: Sequence[int] | None = None,
 ) -> Iterator[tuple[Pair, int]]:
     """One pair per shape, in batches; pair `i` depends on `key`, `i` and shape `i` only.
 
     All batches have the same size, so nothing is compiled twice: the last is filled up with pairs
-    from the start. Each batch comes with the number of its pairs that count.
+    from the start. Each batch comes with the number of its pairs that count. `only` are the numbers
+    of the batches to make.
     """
-    for start in range(0, len(shapes), batch):
+    for start in _starts(len(shapes), batch, only):
         numbers = np.arange(start, start + batch) % len(shapes)
         with same_streams():
             pairs = _make_batch_jit(key, jnp.asarray(numbers), shapes[numbers], config=config)
         yield pairs, min(batch, len(shapes) - start)
+
+
+def _starts(count: int, batch: int, only: Sequence[int] | None) -> Iterable[int]:
+    return range(0, count, batch) if only is None else (number * batch for number in only)
 
 
 def _given_batch(key, numbers, source, target, transform, *, config: PairConfig) -> Pair:
@@ -80,10 +90,11 @@ def given_pair_batches(
     *,
     config: PairConfig,
     batch: int,
+    only: Sequence[int] | None = None,
 ) -> Iterator[tuple[Pair, int]]:
     """As `pair_batches`, for given sources and references with the poses `transforms`."""
     source, target = clouds
-    for start in range(0, len(source), batch):
+    for start in _starts(len(source), batch, only):
         numbers = np.arange(start, start + batch) % len(source)
         matrices = transforms[numbers].astype(source.dtype)
         chosen = (jnp.asarray(numbers), source[numbers], target[numbers], matrices)

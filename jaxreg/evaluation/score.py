@@ -4,7 +4,8 @@ Networks, classical methods and transforms from another program get the same pai
 metrics.
 """
 
-from collections.abc import Collection, Iterator
+import dataclasses
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
 from jaxreg.evaluation import methods, metrics
-from jaxreg.evaluation.run import evaluate_method
+from jaxreg.evaluation.parts import Parts
+from jaxreg.evaluation.run import evaluate_method, registered_batches, together
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.io.arrays import read_arrays
 from jaxreg.progress import counting_progress
@@ -40,10 +42,21 @@ class Scored(NamedTuple):
     seconds: float | None
 
 
+class Stream(NamedTuple):
+    """The test pairs of a configuration: how many, in batches of how many, and the batches.
+
+    `batches(only=None)` takes the numbers of those to make, and yields what `pair_batches` does.
+    """
+
+    count: int
+    batch: int
+    batches: Callable[..., Iterator[tuple[Pair, int]]]
+
+
 def pair_stream(
     config: Config, *, root: str | Path | None, pairs: int = 0, batch: int = 8
-) -> tuple[int, Iterator[tuple[Pair, int]]]:
-    """The number of test pairs, and the pairs in batches; `pairs` limits them to the first so many.
+) -> Stream:
+    """The test pairs in batches; `pairs` limits them to the first so many.
 
     Raises:
       ValueError: the data is missing or malformed, it has no pairs although `config` asks for them,
@@ -52,20 +65,26 @@ def pair_stream(
     key = key_of_tests(config.data.test_seed)
     if config.data.test_pairs_from == "file":
         source, target, transforms = _file_pairs(config, root, pairs)
-        batches = given_pair_batches(
-            (source, target),
-            transforms,
-            key,
-            config=config.test_pairs,
-            batch=min(batch, len(source)),
+        batch = min(batch, len(source))
+        return Stream(
+            len(source),
+            batch,
+            lambda only=None: given_pair_batches(
+                (source, target), transforms, key, config=config.test_pairs, batch=batch, only=only
+            ),
         )
-        return len(source), batches
     points = shape_points(config.test_pairs)
     shapes, _ = load_shapes(config.data, "test", root=root, points=points)
     pair_sizes(config.test_pairs, shapes.shape[1])
     shapes = shapes[: pairs or None]
     batch = min(batch, len(shapes))
-    return len(shapes), pair_batches(shapes, key, config=config.test_pairs, batch=batch)
+    return Stream(
+        len(shapes),
+        batch,
+        lambda only=None: pair_batches(
+            shapes, key, config=config.test_pairs, batch=batch, only=only
+        ),
+    )
 
 
 def _file_pairs(config: Config, root: str | Path | None, pairs: int) -> tuple[np.ndarray, ...]:
@@ -86,13 +105,17 @@ def evaluate(
     refine: str = "",
     pairs: int = 0,
     batch: int = 8,
-) -> Scored:
+    parts: Parts | None = None,
+) -> Scored | None:
     """Evaluate one method on the test pairs of `config`.
 
     `method` is a name for `methods.choose` (by default the released weights that `config` names);
     networks take their `methods.AFTER_TRAINING` from `config.model`. Or `transforms` is a file of
     poses. `refine` (icp, point_to_plane or gicp; ten iterations without annealing, else the
     defaults of `RefineConfig`) improves the poses on the clouds afterwards.
+
+    With `parts`, only this process' batches are registered, and kept in the folder; the result is
+    None if those of other processes are not there yet. The seconds then are those of all processes.
 
     Raises:
       ValueError: both or neither of the two are given; an unknown method or refinement; missing
@@ -102,21 +125,46 @@ def evaluate(
         check_options(section, getattr(config, section))
     name = _evaluated(config, method, transforms)
     improve = _refinement(refine)
-    count, batches = pair_stream(config, root=root, pairs=pairs, batch=batch)
-    first: list[Pair] = []
-    batches = _keep_first(batches, first)
+    stream = pair_stream(config, root=root, pairs=pairs, batch=batch)
     label = (name or f"transforms of {Path(transforms).name}") + (f" + {refine}" if refine else "")
-    given = None if name else _read_transforms(transforms, count)
+    given = None if name else _read_transforms(transforms, stream.count)
     function = methods.choose(name, model=config.model).batch if name else None
     if improve is not None:
         function = improve if function is None else methods.refined_method(function, improve)
     if function is None:
         assert given is not None  # one of the two was asked for
-        predicted, truth, seconds = given, true_transforms(batches), None
+        found = given, true_transforms(stream.batches()), None
+    elif parts is None:
+        with counting_progress(stream.count, label) as progress:
+            found = evaluate_method(function, stream.batches(), progress, initial=given)
     else:
-        with counting_progress(count, label) as progress:
-            predicted, truth, seconds = evaluate_method(function, batches, progress, initial=given)
-    return Scored(label, dataset_label(config.data, root), predicted, truth, first[0], seconds)
+        parts.opened({"method": label, "pairs": stream.count, "batch": stream.batch,
+                      "config": dataclasses.asdict(config)})  # fmt: skip
+        found = _in_parts(function, stream, parts, label, given)
+    if found is None:
+        return None
+    first = jax.tree.map(lambda x: np.asarray(x)[0], next(stream.batches([0]))[0])
+    return Scored(label, dataset_label(config.data, root), found[0], found[1], first, found[2])
+
+
+def _in_parts(
+    function: Callable[..., RigidTransform],
+    stream: Stream,
+    parts: Parts,
+    label: str,
+    initial: RigidTransform | None,
+) -> tuple[RigidTransform, RigidTransform, float] | None:
+    """What `evaluate_method` gives, once the batches of all processes are there."""
+    batches = -(-stream.count // stream.batch)
+    own = parts.own(batches)
+    numbered = ((k, *batch) for k, batch in zip(own, stream.batches(own), strict=True))
+    with counting_progress(len(own) * stream.batch, label) as progress:
+        for number, found in registered_batches(function, numbered, initial=initial):
+            parts.keep(number, found)
+            progress(len(found.truth.rotation))
+    if parts.missing(batches):
+        return None
+    return together(parts.kept(number) for number in range(batches))
 
 
 def _evaluated(config: Config, method: str, transforms: str) -> str:
@@ -226,16 +274,6 @@ def other_convention(scored: Scored) -> str:
         f"seems that these transforms {kind}; in the convention here, y = R x + t from source to "
         f"reference, they are {remedy}."
     )
-
-
-def _keep_first(
-    batches: Iterator[tuple[Pair, int]], first: list[Pair]
-) -> Iterator[tuple[Pair, int]]:
-    """The same batches; the first pair of all is put into `first`, to be drawn as it was evaluated."""
-    for pair, count in batches:
-        if not first:
-            first.append(jax.tree.map(lambda x: np.asarray(x)[0].copy(), pair))
-        yield pair, count
 
 
 def _refinement(name: str) -> methods.BatchRefinement | None:

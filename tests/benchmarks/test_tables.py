@@ -52,7 +52,7 @@ def test_cells_are_of_the_same_pairs_and_are_not_made_again(config, tmp_path, mo
     assert rounds == [0, 3], "the refined row starts from the transforms of the first"
     cells = tables.read_cells("unseen_objects", options)
     assert set(cells) == {*columns.NETWORK, "identity", "icp"}
-    truth = true_transforms(score.pair_stream(config, root=None)[1])
+    truth = true_transforms(score.pair_stream(config, root=None).batches())
     angles = np.degrees(Rotation.from_matrix(truth.rotation).magnitude())
     assert cells["identity"]["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-4)
     assert cells["jaxreg"]["worst_rre_deg"] == 0

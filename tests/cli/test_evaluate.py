@@ -106,7 +106,7 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
         np.testing.assert_array_equal(transform.translation, scored["translation"][0])
     assert np.allclose(transform.rotation, turns[0]) == (not refine)
     assert (str(path), source.shape, reference.shape) == ("first.png", (24, 3), (24, 3))
-    truths = true_transforms(score.pair_stream(config, root=None)[1])
+    truths = true_transforms(score.pair_stream(config, root=None).batches())
     np.testing.assert_array_equal(truth.rotation, truths.rotation[0])
     moved = source @ truth.rotation.T + truth.translation
     distance = np.linalg.norm(moved[:, None] - reference[None], axis=2).min(axis=1)
@@ -287,3 +287,37 @@ def test_data_that_is_not_there_is_one_line_and_status_2(tmp_path, name):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: ")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_processes_share_a_folder_and_the_last_one_prints_the_table(command, monkeypatch):
+    whole = command("--method", "icp", "--batch", "1", "--json", "whole.json")
+    assert whole[0] == 0
+    share = ("--method", "icp", "--batch", "1", "--parts", "p", "--processes", "2")
+    status, output, _ = command(*share, "--process-id", "1", "--json", "half.json")
+    assert status == 0
+    assert "those of others are still missing" in output
+    assert not Path("half.json").exists()
+    monkeypatch.setenv("JAX_NUM_PROCESSES", "2")
+    monkeypatch.setenv("JAX_PROCESS_ID", "0")
+    status, output, _ = command(
+        "--method", "icp", "--batch", "1", "--parts", "p", "--json", "b.json"
+    )
+    assert status == 0
+    one, both = (json.loads(Path(name).read_text()) for name in ("whole.json", "b.json"))
+    assert one.pop("seconds_per_pair") > 0
+    assert both.pop("seconds_per_pair") > 0
+    assert one == both
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--processes", "2", "--process-id", "0"), "give --parts"),
+        (("--parts", "p", "--processes", "2"), "--process-id K is missing"),
+        (("--parts", "p", "--processes", "2", "--process-id", "2"), "from 0 to 1"),
+    ],
+)
+def test_shares_that_do_not_fit_are_refused(command, options, message):
+    status, _, error = command("--method", "identity", *options)
+    assert status == 2
+    assert message in error

@@ -39,7 +39,7 @@ def test_transforms_of_another_program_are_scored_like_our_own(config, tmp_path)
     metrics = [name for name in ours if name not in ("method", "seconds_per_pair")]
     assert {name: ours[name] for name in metrics} == {name: theirs[name] for name in metrics}
     # The identity is wrong by the angle of each true rotation, and by the true translation.
-    truth = true_transforms(score.pair_stream(config, root=None)[1])
+    truth = true_transforms(score.pair_stream(config, root=None).batches())
     angles = np.degrees(np.arccos((np.trace(truth.rotation, axis1=1, axis2=2) - 1) / 2))
     assert ours["mie_r_deg"] == pytest.approx(angles.mean(), rel=1e-4)
     assert ours["mae_t"] == pytest.approx(np.abs(truth.translation).mean(), rel=1e-5)
@@ -64,16 +64,16 @@ def test_refinement_leaves_a_right_pose_where_it_is(config, tmp_path, refine):
         data=dataclasses.replace(config.data, test_shapes=12),
         test_pairs=PairConfig(points=256, kept=192),
     )
-    truth = true_transforms(score.pair_stream(partial, root=None)[1])
+    truth = true_transforms(score.pair_stream(partial, root=None).batches())
     np.savez(tmp_path / "true.npz", **truth._asdict())
     found = scored(partial, transforms=str(tmp_path / "true.npz"), refine=refine)
     assert found["worst_rre_deg"] < 0.01
 
 
 def test_saved_pairs_are_the_evaluated_ones(config, tmp_path):
-    _, stream = score.pair_stream(config, root=None, batch=2)
+    stream = score.pair_stream(config, root=None, batch=2).batches()
     score.save_pairs(str(tmp_path / "pairs.npz"), stream)
-    truth = true_transforms(score.pair_stream(config, root=None)[1])
+    truth = true_transforms(score.pair_stream(config, root=None).batches())
     with np.load(tmp_path / "pairs.npz", allow_pickle=False) as pairs:
         source, reference = pairs["source"][0], pairs["reference"][0]
     moved = source @ truth.rotation[0].T + truth.translation[0]

@@ -1,0 +1,96 @@
+"""An evaluation in parts: processes that share a folder, and one that goes on where it ended.
+
+Every batch of pairs is a part. Which process registers it changes no bit of the result, since all of
+them make the same batch and run the same program. A part is kept as soon as it is done; whoever finds
+all of them there has the whole.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxreg.io.arrays import read_arrays
+from jaxreg.types import RigidTransform
+
+_WHAT = "evaluation.json"
+
+
+class Registered(NamedTuple):
+    """Predicted and true transforms of some pairs (numpy, stacked), and the seconds they took."""
+
+    predicted: RigidTransform
+    truth: RigidTransform
+    seconds: float
+
+
+class Parts(NamedTuple):
+    """The folder of an evaluation, and which batches are this process' own.
+
+    Its own are every `processes`-th, from the `number`-th of them on.
+    """
+
+    folder: Path
+    number: int = 0
+    processes: int = 1
+
+    def opened(self, what: dict[str, Any]) -> None:
+        """Make the folder, or look whether it holds parts of the same evaluation.
+
+        Raises:
+          ValueError: it holds those of another; the numbers of the processes do not fit.
+        """
+        if not 0 <= self.number < self.processes:
+            raise ValueError(
+                f"process {self.number} of {self.processes}: processes are counted from 0 to "
+                f"{self.processes - 1}."
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        place, text = self.folder / _WHAT, json.dumps(what, indent=1, default=str) + "\n"
+        if not place.exists():
+            self._write(place, text.encode())
+        elif place.read_text(encoding="utf-8") != text:
+            raise ValueError(
+                f"{self.folder} holds parts of another evaluation ({place} says which): give another "
+                "folder, or delete it."
+            )
+
+    def own(self, batches: int) -> list[int]:
+        """The numbers of this process' batches that are not there yet, of so many."""
+        mine = range(self.number, batches, self.processes)
+        return [number for number in mine if not self._place(number).exists()]
+
+    def missing(self, batches: int) -> int:
+        """How many batches are not there yet, of so many."""
+        return sum(not self._place(number).exists() for number in range(batches))
+
+    def keep(self, number: int, found: Registered) -> None:
+        """Write a batch, whole or not at all."""
+        names = ("rotation", "translation", "true_rotation", "true_translation", "seconds")
+        arrays = (*found.predicted, *found.truth, np.asarray(found.seconds))
+        temporary = self._temporary(self._place(number))
+        with temporary.open("wb") as file:
+            np.savez(file, **dict(zip(names, arrays, strict=True)))
+        os.replace(temporary, self._place(number))
+
+    def kept(self, number: int) -> Registered:
+        """A batch that is there."""
+        names = ("rotation", "translation", "true_rotation", "true_translation", "seconds")
+        remedy = "delete it, and run again"
+        arrays = read_arrays(self._place(number), names, remedy=remedy)
+        rotation, translation, *truth, seconds = (arrays[name] for name in names)
+        return Registered(
+            RigidTransform(rotation, translation), RigidTransform(*truth), float(seconds)
+        )
+
+    def _place(self, number: int) -> Path:
+        return self.folder / f"batch_{number:06d}.npz"
+
+    def _temporary(self, place: Path) -> Path:
+        return place.with_name(f".{place.name}.{self.number}")
+
+    def _write(self, place: Path, content: bytes) -> None:
+        self._temporary(place).write_bytes(content)
+        os.replace(self._temporary(place), place)
