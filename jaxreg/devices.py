@@ -41,6 +41,7 @@ def join_processes(
         option: os.environ.get(variable) if value is None else value
         for (option, value), variable in zip(given.items(), _VARIABLES, strict=True)
     }
+    jax.config.update("jax_enable_recoverability", True)  # or those who are left cannot ask who is
     missing = [option for option, value in known.items() if value is None]
     if len(missing) == len(known):
         if int(os.environ.get("SLURM_NTASKS", "1")) > 1:
@@ -126,6 +127,17 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+def _lost() -> str:
+    """Which processes are gone, as the coordinator knows once they have missed their heartbeats."""
+    try:
+        with multihost_utils.live_devices(jax.devices()) as alive:
+            left = {device.process_index for device in alive}
+    except Exception:  # noqa: BLE001 - an unstable part of JAX, and the coordinator may be gone
+        return "another one"
+    gone = [str(number) for number in range(jax.process_count()) if number not in left]
+    return f"process {', '.join(gone)}" if gone else "another one"
+
+
 class Watch:
     """Whether this process, or another of the run, was asked to end (SIGTERM, as schedulers send)."""
 
@@ -154,7 +166,7 @@ class Watch:
 def watched() -> Iterator[Watch]:
     """A `Watch` over the block; where other threads train, signals are left alone.
 
-    If another process dies, the error of this one says so: JAX tells of a lost connection only.
+    If another process dies, the error of this one says which: JAX tells of a lost connection only.
     """
     watch = Watch()
     alone = jax.process_count() == 1  # else JAX's own handler tells all of them
@@ -164,12 +176,13 @@ def watched() -> Iterator[Watch]:
     )
     try:
         yield watch
-    except jax.errors.JaxRuntimeError as error:
-        if alone:
-            raise
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        # JAX's collectives on the host raise ValueError for a lost connection.
         first = str(error).partition("\n")[0]
+        if alone or (isinstance(error, ValueError) and "Gloo" not in first):
+            raise
         sys.stderr.write(
-            f"error: process {jax.process_index()} of {jax.process_count()} lost another one: start "
+            f"error: process {jax.process_index()} of {jax.process_count()} lost {_lost()}: start "
             f"all of them again, and the run goes on from its last checkpoint ({first}).\n"
         )
         sys.stderr.flush()

@@ -148,7 +148,7 @@ def test_a_process_that_is_killed_ends_the_others_with_a_message(tmp_path):
     second.communicate()
     told = first.communicate(timeout=LIMIT)[0]
     assert first.returncode == 2, told
-    assert "error: process 0 of 2 lost another one: start all of them again" in told
+    assert "error: process 0 of 2 lost process 1: start all of them again" in told
 
 
 def wait_for(workdir: Path, *, step: int) -> None:
