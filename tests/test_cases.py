@@ -19,6 +19,7 @@ from jaxreg import compilation, evaluation, model, scoring
 from jaxreg.config import Config, DataConfig, PairConfig, RegisterConfig
 from jaxreg.data.shapes import sample_shape
 from jaxreg.dense import register_dense
+from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.gicp import gicp
 from jaxreg.refine.host import refine
 from jaxreg.refine.icp import icp
@@ -40,7 +41,9 @@ data = DataConfig(name="shapes", test_shapes=2)
 config = Config(test_pairs=PairConfig(points=64, kept=48), data=data)
 count, batches = scoring.pair_stream(config, root=None)
 assert evaluation.true_transforms(batches).rotation.shape == (count, 3, 3)
-assert 0 < jaxreg.register(cloud[:20], cloud[:20]).seconds < 60
+found = jaxreg.register(cloud, cloud, initial=np.eye(4), refine="icp")
+assert found.converged and 0 < found.seconds < 60
+assert Evidence(*range(13)).gap == Evidence(*range(13)).distance
 assert subprocess.run([sys.executable, "-c", "from jaxreg.dense import register_dense"]).returncode == 0
 try:
     from jaxreg.config import register_dense

@@ -222,8 +222,8 @@ def iterate(
 ) -> tuple[RigidTransform, Any, Variables]:
     """N_l registration steps.
 
-    With `train`, BatchNorm takes its statistics over the `vmap` axis `features.BATCH_AXIS`, the
-    matching goes through the batch pair by pair, and only reverse mode differentiates it.
+    With `train`, BatchNorm takes its statistics over the `vmap` axis `features.BATCH_AXIS`, and the
+    matching goes through the batch pair by pair.
 
     Returns the transform from source to reference (the composition of the steps), what `observe`
     returned for each step and the source's graph, stacked, and the variables with updated statistics.
@@ -266,8 +266,8 @@ def iterate(
     start = (rigid.identity(source.points.dtype), variables)
     # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
     # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
-    # memory. (In training the maps are not seen here: `one_at_a_time` recomputes them.)
-    kept = jax.checkpoint_policies.save_only_these_names(*KEPT, _MATCHES)
+    # memory. In training `one_at_a_time` recomputes the maps, too.
+    kept = jax.checkpoint_policies.save_only_these_names(_MATCHES, *(() if train else KEPT))
     step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables

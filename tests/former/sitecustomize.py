@@ -23,6 +23,7 @@ NAMES = {
     "jaxreg.compilation.jit": "jax.jit",
     "jaxreg.config.RegisterConfig": "jaxreg.scans.config.RegisterConfig",
     "jaxreg.dense.register_dense": "jaxreg.search.pipeline.register_global",
+    "jaxreg.judge.evidence.Evidence": "jaxreg.judge.evidence.Evidence",
     "jaxreg.refine.gicp.gicp": "jaxreg.refine.gicp.gicp",
     "jaxreg.refine.host.refine": "jaxreg.refine.host.refine_on_host",
     "jaxreg.refine.icp.icp": "jaxreg.refine.point_to_point.icp",
@@ -69,11 +70,15 @@ def _config(today):
     return former
 
 
-def _timed(register):
-    """`register`, whose results once knew how long they took."""
+def _registering(register):
+    """`register`, which once took the name of the refinement, and told how long it took."""
 
     @functools.wraps(register)
-    def former(*clouds, **given):
+    def former(*clouds, refine=None, **given):
+        if refine is not None:
+            config = today("jaxreg.config.RegisterConfig")()
+            settings = dataclasses.replace(config.refine, method=refine)
+            given["config"] = dataclasses.replace(config, refine=settings)
         begin = time.perf_counter()
         found = register(*clouds, **given)
         object.__setattr__(found, "seconds", time.perf_counter() - begin)
@@ -82,11 +87,18 @@ def _timed(register):
     return former
 
 
+def _with_gap(evidence):
+    """The evidence for a pose, whose distance of the surfaces was once called the gap."""
+    evidence.gap = property(lambda found: found.distance)
+    return evidence
+
+
 _ADAPTED = {
     "jaxreg.config.RegisterConfig": _config,
+    "jaxreg.judge.evidence.Evidence": _with_gap,
     "jaxreg.refine.gicp.gicp": _method,
     "jaxreg.refine.icp.icp": _method,
-    "jaxreg.scans.pair.register": _timed,
+    "jaxreg.scans.pair.register": _registering,
 }
 _TOUCHED = {name.rpartition(".")[0] for name in NAMES} | {"jaxreg.evaluation", *MODULES}
 
