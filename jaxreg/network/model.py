@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.batching import one_at_a_time
 from jaxreg.config import Config, ModelConfig, check_options
 from jaxreg.geometry import arguments, rigid
@@ -263,7 +264,8 @@ def iterate(
         seen = observe(Step(points, moved, motion, matches, confidence, inliers), source_graph)
         return (rigid.compose(motion, total), variables), seen
 
-    start = (rigid.identity(source.points.dtype), variables)
+    start = rigid.identity(source.points.dtype)
+    start = (jax.tree.map(lambda x: varying_like(x, source.points[0, 0]), start), variables)
     # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
     # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
     # memory. In training `one_at_a_time` recomputes the maps, too.
@@ -314,6 +316,7 @@ def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
     return variables | jax.tree.map(lambda x: jnp.asarray(x, dtype), dict(cast))
 
 
+@on_any_mesh
 def register_pair(
     variables: Variables,
     source: Float[Array, "n 3"],

@@ -28,6 +28,7 @@ NAMES = {
     "jaxreg.refine.host.refine": "jaxreg.refine.host.refine_on_host",
     "jaxreg.refine.icp.icp": "jaxreg.refine.point_to_point.icp",
     "jaxreg.scans.pair.register": "jaxreg.scans.pair.register",
+    "jaxreg.training.load_checkpoint": "jaxreg.weights.checkpoint.load_checkpoint",
 }
 """What was called so: what it is called today. The same name twice: its arguments changed."""
 SETTINGS = ("iterations", "trim")
