@@ -90,6 +90,21 @@ def varying_like(x: Shaped[Array, "..."], like: Shaped[Array, "..."]) -> Shaped[
     return jnp.where(jax.lax.stop_gradient(like) == 0, x, x)
 
 
+def from_host(function: _Function) -> _Function:
+    """`function`, a jitted one, for arrays of the host: it is meant to take them from there.
+
+    So `jax.transfer_guard("disallow")`, with which programs look for transfers that nobody meant, does
+    not stop it. (To `jax.device_put` every argument takes longer than most of these functions.)
+    """
+
+    @functools.wraps(function)
+    def call(*arguments, **static):
+        with jax.transfer_guard_host_to_device("allow"):
+            return function(*arguments, **static)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
 def on_any_mesh(function: _Function) -> _Function:
     """`function` of one pair, in which XLA decides what lies where, whatever axes a mesh has.
 

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from jax import export
 
+import jaxreg
 from jaxreg import training
 from jaxreg.config import from_dict
+from jaxreg.refine.host import refine_on_host
 from jaxreg.types import Refinement
 from tests.compiled import icp
 
@@ -26,6 +28,27 @@ def test_a_saved_program_gives_the_same_record(seed):
     found = export.deserialize(saved).call(source, reference)
     assert isinstance(found, Refinement)
     jax.tree.map(np.testing.assert_array_equal, found, icp(source, reference))
+
+
+HOST = {
+    "few": lambda p: jaxreg.register(p[:8], p[:8]),
+    "in the plane": lambda p: jaxreg.register(p[:, :2], p[:, :2] + 0.1, initial=np.eye(4)),
+    "surfaces": lambda p: jaxreg.register(p, p, initial=np.eye(4)),
+    "refinement": lambda p: refine_on_host(p, p),
+}
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("name", HOST)
+def test_functions_of_the_host_run_where_stray_transfers_are_an_error(name, seed):
+    points = np.random.default_rng(seed).normal(size=(90, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    free = HOST[name](points)
+    with jax.transfer_guard("disallow"):
+        with pytest.raises(Exception, match="Disallowed host-to-device transfer"):
+            jax.jit(jnp.sum)(points)
+        found = HOST[name](points)
+    np.testing.assert_array_equal(found.transform.rotation, free.transform.rotation)
 
 
 TWO_DEVICES = """
