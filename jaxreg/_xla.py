@@ -4,9 +4,16 @@ Each was measured on jaxlib 0.10 (benchmarks/speed/speed.py shows the stages); c
 one.
 """
 
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Shaped
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def row_min(x: Shaped[Array, "n m"]) -> Shaped[Array, "n"]:
@@ -81,3 +88,43 @@ def varying_like(x: Shaped[Array, "..."], like: Shaped[Array, "..."]) -> Shaped[
     with a state that differs. The choice between `x` and `x` is nothing to compute.
     """
     return jnp.where(jax.lax.stop_gradient(like) == 0, x, x)
+
+
+def from_host(function: _Function) -> _Function:
+    """`function`, a jitted one, for arrays of the host: it is meant to take them from there.
+
+    So `jax.transfer_guard("disallow")`, with which programs look for transfers that nobody meant, does
+    not stop it. (To `jax.device_put` every argument takes longer than most of these functions.)
+    """
+
+    @functools.wraps(function)
+    def call(*arguments, **static):
+        with jax.transfer_guard_host_to_device("allow"):
+            return function(*arguments, **static)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def on_any_mesh(function: _Function) -> _Function:
+    """`function` of one pair, in which XLA decides what lies where, whatever axes a mesh has.
+
+    Where the axes of a mesh are explicit, as those of `jax.make_mesh` are, JAX asks of every operation
+    how its operands lie, and has no answer for a choice between two poses of a batch. What belongs to
+    a pair lies whole on the device of that pair, so there is nothing to say.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments, **named):
+        if not jax.sharding.get_abstract_mesh().explicit_axes:
+            return function(*arguments, **named)
+        leaves, tree = jax.tree.flatten((arguments, named))
+        arrays = {i: x for i, x in enumerate(leaves) if hasattr(x, "dtype")}
+
+        def inside(arrays):
+            whole = [arrays.get(i, leaf) for i, leaf in enumerate(leaves)]
+            arguments, named = jax.tree.unflatten(tree, whole)
+            return function(*arguments, **named)
+
+        return jax.sharding.auto_axes(inside, out_sharding=PartitionSpec())(arrays)
+
+    return call  # pyright: ignore[reportReturnType]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.custom_batching import sequential_vmap
+from jax.custom_batching import custom_vmap
 
 
 def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -18,27 +18,29 @@ def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def one_at_a_time(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """``function(inputs, constants)`` that is batched, with its gradient, by a loop.
+    """``function(inputs, constants)`` that is batched by a loop.
 
     For a part of a program whose other parts need the whole batch at once, as BatchNorm does; see
-    `map_pairs`. The gradient recomputes the function and stores only its arguments. Reverse mode
-    only, and `constants` has no derivative. Off the CPU it is `function` itself.
+    `map_pairs`. The derivatives of the batch, of any order, recompute the function and store only its
+    arguments; within `jax.vmap` there are forward ones only. Off the CPU it is `function` itself.
     """
     if jax.default_backend() != "cpu":
         return function
+    recomputed = jax.checkpoint(function, prevent_cse=False)
+    call = custom_vmap(function)
 
-    # On its own, sequential_vmap supports forward mode only.
-    call = jax.custom_vjp(sequential_vmap(function))
+    @call.def_vmap
+    def loop(axis_size, batched, inputs, constants):
+        leaves, tree = jax.tree.flatten((inputs, constants))
+        mapped = jax.tree.leaves(batched)
 
-    @sequential_vmap
-    def pull_back(inputs, constants, cotangent):
-        return jax.vjp(lambda x: function(x, constants), inputs)[1](cotangent)[0]
+        def one(own):
+            rest = iter(own)
+            pair = [next(rest) if has else leaf for leaf, has in zip(leaves, mapped, strict=True)]
+            return recomputed(*jax.tree.unflatten(tree, pair))
 
-    def forward(inputs, constants):
-        return call(inputs, constants), (inputs, constants)
+        own = [leaf for leaf, has in zip(leaves, mapped, strict=True) if has]
+        found = jax.lax.map(one, own)
+        return found, jax.tree.map(lambda _: True, found)
 
-    def backward(arguments, cotangent):
-        return pull_back(*arguments, cotangent), None
-
-    call.defvjp(forward, backward)
     return call

@@ -49,3 +49,35 @@ def test_so_does_their_gradient_where_vmap_shares_arguments_too(seed, shared):
     chex.assert_trees_all_close(
         gradient(one_at_a_time(smooth)), gradient(smooth), rtol=1e-12, atol=1e-14
     )
+
+
+def directions(seed, like):
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), like)
+
+
+def curvatures(loss, inputs, along):
+    """The product of the second derivative with a direction, in both modes."""
+    forward = jax.jvp(jax.grad(loss), (inputs,), (along,))[1]
+    reverse = jax.grad(lambda x: jax.jvp(loss, (x,), (along,))[1])(inputs)
+    dots = jax.grad(
+        lambda x: sum(
+            jnp.vdot(a, b)
+            for a, b in zip(jax.tree.leaves(jax.grad(loss)(x)), jax.tree.leaves(along), strict=True)
+        )
+    )(inputs)
+    return forward, reverse, dots
+
+
+def test_so_does_their_second_derivative_in_every_mode(seed):
+    inputs, constants = batch_of_pairs(seed)
+    along = directions(seed + 1, inputs)
+
+    def loss(function, inputs):
+        result = jax.vmap(function)(inputs, constants)
+        return sum(jnp.sum(jnp.cos(x)) for x in result.values())
+
+    ours = jax.jit(lambda x: curvatures(lambda y: loss(one_at_a_time(smooth), y), x, along))
+    expected = jax.jvp(jax.grad(lambda x: loss(smooth, x)), (inputs,), (along,))[1]
+    for found in ours(inputs):
+        chex.assert_trees_all_close(found, expected, rtol=1e-11, atol=1e-13)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Float
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments
 from jaxreg.geometry.eigen3x3 import pseudo_inverse
 from jaxreg.geometry.numerics import safe_sqrt
@@ -17,6 +18,7 @@ from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.types import RigidTransform
 
 
+@on_any_mesh
 def weighted_procrustes(
     source: Float[Array, "n 3"], reference: Float[Array, "n 3"], weights: Float[Array, "n"]
 ) -> RigidTransform:
@@ -85,6 +87,7 @@ def upright_procrustes(
     return RigidTransform(rotation, reference_centroid - rotated)
 
 
+@on_any_mesh
 def robust_procrustes(
     source: Float[Array, "n 3"],
     reference: Float[Array, "n 3"],

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.special import softmax
 
 from jaxreg.judge.evidence import Evidence
 
@@ -47,6 +48,11 @@ def log_odds(evidence: Evidence) -> Float[Array, "*k"]:
     """
     terms = jax.tree.map(jnp.multiply, WEIGHTS, features(evidence))
     return INTERCEPT + jnp.sum(jnp.stack(terms), axis=0)
+
+
+def chances(score: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+    """`probabilities` on the host, where every number of poses would be a program of its own."""
+    return np.asarray(softmax(np.append(np.asarray(score, np.float64), 0.0))[:-1])
 
 
 def probabilities(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.batching import one_at_a_time
 from jaxreg.config import Config, ModelConfig, check_options
 from jaxreg.geometry import arguments, rigid
@@ -224,8 +225,8 @@ def iterate(
 ) -> tuple[RigidTransform, Any, Variables]:
     """N_l registration steps.
 
-    With `train`, BatchNorm takes its statistics over the `vmap` axis `features.BATCH_AXIS`, the
-    matching goes through the batch pair by pair, and only reverse mode differentiates it.
+    With `train`, BatchNorm takes its statistics over the `vmap` axis `features.BATCH_AXIS`, and the
+    matching goes through the batch pair by pair.
 
     Returns the transform from source to reference (the composition of the steps), what `observe`
     returned for each step and the source's graph, stacked, and the variables with updated statistics.
@@ -265,11 +266,12 @@ def iterate(
         seen = observe(Step(points, moved, motion, matches, confidence, inliers), source_graph)
         return (rigid.compose(motion, total), variables), seen
 
-    start = (rigid.identity(source.points.dtype), variables)
+    start = rigid.identity(source.points.dtype)
+    start = (jax.tree.map(lambda x: varying_like(x, source.points[0, 0]), start), variables)
     # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
     # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
-    # memory. (In training the maps are not seen here: `one_at_a_time` recomputes them.)
-    kept = jax.checkpoint_policies.save_only_these_names(*KEPT, _MATCHES)
+    # memory. In training `one_at_a_time` recomputes the maps, too.
+    kept = jax.checkpoint_policies.save_only_these_names(_MATCHES, *(() if train else KEPT))
     step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables
@@ -316,6 +318,7 @@ def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
     return variables | jax.tree.map(lambda x: jnp.asarray(x, dtype), dict(cast))
 
 
+@on_any_mesh
 def register_pair(
     variables: Variables,
     source: Float[Array, "n 3"],

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments, eigen3x3
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
@@ -16,6 +17,7 @@ from jaxreg.refine.solve import set_up, solve
 from jaxreg.types import Refinement, RigidTransform
 
 
+@on_any_mesh
 def gicp(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg._xla import from_host
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_points
 from jaxreg.geometry.rigid import nearest_rotation
@@ -134,6 +135,7 @@ def in_units(uncertainty: PoseUncertainty, where: frame.Frame) -> PoseUncertaint
     )
 
 
+@from_host
 @partial(jax.jit, static_argnames=("kernel", "trim"))
 def _uncertainty(
     pose, source, source_scale, reference, reference_scale, normals, pairs, distance, *,

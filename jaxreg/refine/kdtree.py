@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg._xla import from_host
 from jaxreg.geometry.clouds import padded_size
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.config import RefineConfig
@@ -223,12 +224,14 @@ def _rows(cloud: IndexedCloud, like: np.ndarray, stride: int) -> np.ndarray:
     return np.broadcast_to(np.arange(0, len(cloud.points), stride), like.shape)
 
 
+@from_host
 @jax.jit
 def _described(points, neighbors, given):
     across = normals(points, neighbors) if given is None else given
     return across, edge_normals(points, neighbors, across)
 
 
+@from_host
 @partial(jax.jit, static_argnames="config")
 def _steps(
     poses, source, reference, pairs, kernel_scale, distance, width, motions, *, config: RefineConfig
@@ -242,6 +245,7 @@ def _steps(
     return jax.lax.map(one, (poses, pairs))
 
 
+@from_host
 @partial(jax.jit, static_argnames="config")
 def _step(
     pose, source, reference, pairs, kernel_scale, distance, width, motions, *, config: RefineConfig

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
@@ -13,6 +14,7 @@ from jaxreg.refine.solve import set_up, solve
 from jaxreg.types import Refinement, RigidTransform
 
 
+@on_any_mesh
 def point_to_plane(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],

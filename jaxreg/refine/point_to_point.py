@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry.procrustes import weighted_procrustes
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import Pairs
@@ -12,6 +13,7 @@ from jaxreg.refine.solve import set_up, solve
 from jaxreg.types import Refinement, RigidTransform
 
 
+@on_any_mesh
 def icp(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],

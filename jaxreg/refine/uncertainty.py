@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.geometry.neighbors import knn
 from jaxreg.geometry.normals import normals
@@ -82,6 +83,7 @@ class WeakDirection(NamedTuple):
         return f"{verb.get(self.kind, 'translation along')} ({axis})"
 
 
+@on_any_mesh
 def pose_uncertainty(
     transform: RigidTransform,
     source: Float[Array, "n 3"],

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxreg._xla import from_host
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
 from jaxreg.judge.evidence import REACH, Evidence, read_evidence
 from jaxreg.judge.odds import log_odds
@@ -91,7 +92,10 @@ def read(
 
 def odds(evidence: Evidence) -> Float[np.ndarray, "k"]:
     """The log odds of evidence in numpy."""
-    return np.asarray(log_odds(evidence), np.float64)
+    return np.asarray(_log_odds(evidence), np.float64)
+
+
+_log_odds = from_host(jax.jit(log_odds))
 
 
 def _padded(poses: RigidTransform) -> RigidTransform:
@@ -101,6 +105,7 @@ def _padded(poses: RigidTransform) -> RigidTransform:
     return RigidTransform(*(np.concatenate([p, p[-1:].repeat(size - count, 0)]) for p in poses))
 
 
+@from_host
 @jax.jit
 def _read(poses, source, reference, scales, there, back):
     source, reference = (

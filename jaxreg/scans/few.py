@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.graph import se3
-from jaxreg.judge.odds import probabilities
+from jaxreg.judge.odds import chances as chances_of
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import triples
 from jaxreg.scans.known import Known
@@ -63,7 +63,7 @@ def registered(
     if not found or found[0].log_odds <= 0:
         return None
     best = found[0]
-    chances = np.asarray(probabilities(np.array([one.log_odds for one in found])))
+    chances = chances_of(np.array([one.log_odds for one in found]))
     accuracy = _accuracy(x, best, known, reference.centre, unit)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxreg.geometry import frame
 from jaxreg.geometry.rigid import rotation_angle_deg
-from jaxreg.judge.odds import probabilities
+from jaxreg.judge.odds import chances
 from jaxreg.scans import candidates, prepare, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
@@ -105,7 +105,7 @@ class _Judged(NamedTuple):
 
 
 def _likeliest(judged: list[_Judged]) -> float:
-    return float(probabilities(np.array([one.score for one in judged])).max()) if judged else 0.0
+    return float(chances(np.array([one.score for one in judged])).max()) if judged else 0.0
 
 
 def _judged(

@@ -9,14 +9,13 @@ import math
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import clouds as checks
 from jaxreg.judge.evidence import REACH, Evidence
-from jaxreg.judge.odds import probabilities
+from jaxreg.judge.odds import chances as chances_of
 from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, weak_directions
 from jaxreg.scans import candidates, correlation, planes, verdict
@@ -109,7 +108,7 @@ def registered(
     pose, *others = (
         RigidTransform(ranked.poses.rotation[i], ranked.poses.translation[i]) for i in order
     )
-    chances = np.asarray(probabilities(ranked.score[order]))
+    chances = chances_of(ranked.score[order])
     judged = jax.tree.map(lambda leaf: float(leaf[best]), ranked.evidence)
     fit = _closed(x, y, ratio, pose, config)
     accuracy = _accuracy(fit, reference, config)
@@ -176,7 +175,7 @@ def _examined(points: Float[np.ndarray, "j 3"], tree: cKDTree, cloud: Prepared) 
         np.arange(size) < len(points),
         np.float32(np.median(distance[:, min(2, count)])),
     )
-    return Examined(*(jnp.asarray(part) for part in parts))
+    return Examined(*jax.device_put(parts))
 
 
 def _searched(

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg._xla import from_host
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
@@ -266,9 +267,10 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
     return float(np.median(found.query(points, k=k + 1, workers=-1)[0][:, -1]))
 
 
-_examine = jax.jit(examine)
+_examine = from_host(jax.jit(examine))
 
 
+@from_host
 @functools.partial(jax.jit, static_argnames="radii")
 def _describe(points, mask, unit, normals, neighbors, *, radii: tuple[float, ...]) -> Described:
     return describe(

@@ -9,11 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg._xla import from_host
 from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import padded_size, sizes_of_pair
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.judge.evidence import Evidence
-from jaxreg.judge.odds import probabilities
+from jaxreg.judge.odds import chances
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
 from jaxreg.scans import candidates, dense, diagnosis, prepare, stable, verdict
@@ -131,9 +132,9 @@ def searched(problem: Problem) -> Found:
     """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
     config, most = problem.config, math.radians(problem.known.max_rotation_deg)
     found = searched_and_judged(problem, config.search)
-    if config.wide is not None and probabilities(found.score).max() < SURE:
+    if config.wide is not None and chances(found.score).max() < SURE:
         found = candidates.merged(found, searched_and_judged(problem, config.wide))
-        if (nearer := closer(problem)) and probabilities(found.score).max() < SURE:
+        if (nearer := closer(problem)) and chances(found.score).max() < SURE:
             found = candidates.merged(found, searched_and_judged(nearer, config.wide))
     turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
     # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
@@ -148,7 +149,7 @@ def searched(problem: Problem) -> Found:
     return Found(
         poses[best],
         tuple((poses[i], float(found.score[i])) for i in others),
-        float(probabilities(found.score)[best]),
+        float(chances(found.score)[best]),
     )
 
 
@@ -225,7 +226,7 @@ def _program(search: SearchConfig, learned: bool):
         )
 
     network = jax.device_put(load_features()) if learned else None
-    return functools.partial(jax.jit(run), network)
+    return functools.partial(from_host(jax.jit(run)), network)
 
 
 def refine_pose(problem: Problem, pose: RigidTransform) -> Refined:
@@ -310,14 +311,14 @@ def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegis
     cause = cause or verdict.in_a_volume(
         judged, source.fine.examined, problem.reference.fine.examined
     )
-    chances = np.asarray(probabilities(np.array([score[0], *(s for _, s in found.others)])))
-    chance = 0.0 if cause or verdict.is_free(judged) else float(chances[0])
-    success = verdict.is_success(chance, chances[1:], refined.converged)
+    likelihood = chances(np.array([score[0], *(s for _, s in found.others)]))
+    chance = 0.0 if cause or verdict.is_free(judged) else float(likelihood[0])
+    success = verdict.is_success(chance, likelihood[1:], refined.converged)
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(problem.known.held(refined.uncertainty))
     )
-    reason = cause or _reason(problem, refined, judged, weak, float(chances[1:].sum()))
+    reason = cause or _reason(problem, refined, judged, weak, float(likelihood[1:].sum()))
     return assembled(
         (source, problem.reference),
         in_unit(refined.transform, length),
@@ -327,7 +328,7 @@ def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegis
         overlap=_overlap(problem, refined.transform),
         alternatives=tuple(
             Alternative(frame.transform_out(where, other), float(likely))
-            for (other, _), likely in zip(found.others, chances[1:], strict=True)
+            for (other, _), likely in zip(found.others, likelihood[1:], strict=True)
             if likely >= LISTED
         ),
         notes=closing.notes,

@@ -1,8 +1,10 @@
 """Whether a pose is to be trusted, and what speaks against it, in words."""
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg._xla import from_host
 from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import WEIGHTS, features
 from jaxreg.judge.surface import Examined
@@ -30,6 +32,8 @@ _SPEAKS = Evidence(
     unseen=-1, rough=1, ends=-1, held=1, same=1, sparse=-1,
 )  # fmt: skip
 """Whether more of it speaks for a pose or against it, as the sentences of `reason` presume."""
+
+_features = from_host(jax.jit(features))
 
 
 def is_free(found: Evidence) -> bool:
@@ -68,7 +72,7 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> s
         return f"The surfaces leave the pose free: {free}."
     if rivals >= RIVAL:
         return "Another pose agrees about as well (see alternatives)."
-    short = np.array(WEIGHTS) * (np.array(features(found)) - np.array(features(_USUAL)))
+    short = np.array(WEIGHTS) * (np.array(_features(found)) - np.array(_features(_USUAL)))
     # The sentence of a field whose fitted weight has the other sign would say what is not the case.
     short = np.where(np.array(WEIGHTS) * np.array(_SPEAKS) > 0, short, 0)
     held = ", ".join(direction.name for direction in weak) or "see sigma"

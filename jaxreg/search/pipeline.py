@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
@@ -26,6 +27,7 @@ _RMS_OF_UNIT_SPHERE = 0.5
 """Root mean square radius of a usual shape that touches the unit sphere (ModelNet40: 0.4 to 0.6)."""
 
 
+@on_any_mesh
 def register_global(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],
@@ -69,6 +71,7 @@ def register_global(
     return _registration(where, pose, clouds, masks, found.score[0])
 
 
+@on_any_mesh
 def search_poses(
     source: Float[Array, "n 3"],
     reference: Float[Array, "m 3"],

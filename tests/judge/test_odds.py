@@ -1,12 +1,13 @@
 """From evidence to probabilities: the formulas of the module, and cases that leave no doubt."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxreg.data.procedural import shapes
 from jaxreg.judge.evidence import Evidence
-from jaxreg.judge.odds import INTERCEPT, WEIGHTS, features, log_odds, probabilities
+from jaxreg.judge.odds import INTERCEPT, WEIGHTS, chances, features, log_odds, probabilities
 from jaxreg.types import RigidTransform
 from tests.judge.clouds import examined, partners, random_pose, read
 
@@ -94,3 +95,20 @@ def test_what_is_not_counted_has_no_chance_and_takes_none(seed):
 def test_large_scores_do_not_overflow():
     found = np.asarray(probabilities(np.float32([1e4, 1e4 - 1, -1e4])))
     np.testing.assert_allclose(found, [1 / (1 + np.exp(-1)), 1 / (1 + np.e), 0], rtol=1e-5)
+
+
+def test_chances_on_the_host_are_the_same_probabilities(seed):
+    scores = np.random.default_rng(seed).normal(scale=5, size=9)
+    exact = np.exp(scores) / (1 + np.exp(scores).sum())
+    np.testing.assert_allclose(chances(scores), exact, rtol=1e-12)
+    np.testing.assert_allclose(probabilities(scores), exact, rtol=1e-12)
+    assert chances(np.array([-np.inf, 800.0])).tolist() == [0, 1]
+
+
+def test_any_number_of_poses_is_judged_without_a_compilation(caplog):
+    with jax.log_compiles(True), caplog.at_level("WARNING", logger="jax"):
+        for count in (2, 13, 31):
+            chances(np.zeros(count))
+        assert not caplog.records
+        probabilities(np.zeros(37))
+    assert caplog.records
