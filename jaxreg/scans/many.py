@@ -242,7 +242,9 @@ class _Run(NamedTuple):
         for k, other in enumerate(self.relations):
             if (other.source, other.reference) == (relation.source, relation.reference):
                 if relation.probability > other.probability or other.how == "search":
-                    self.relations[k] = relation
+                    # A pose that is given has no rival, which is not the same as having none.
+                    rivals = max(relation.rivals, other.rivals)
+                    self.relations[k] = dataclasses.replace(relation, rivals=rivals)
                 return
         self.relations.append(relation)
 

@@ -16,6 +16,7 @@ from jaxreg.graph.pose_graph import CHI_SQUARED, PoseGraph, squared_errors
 from jaxreg.graph.sparse import pose_covariances, solve_poses
 from jaxreg.graph.trees import components, spanning_tree, tree_poses, triangle_errors, triangles
 from jaxreg.scans.relation import Relation
+from jaxreg.scans.verdict import RIVAL
 from jaxreg.types import RigidTransform
 
 SURE = 0.9
@@ -29,6 +30,9 @@ _BY_CHANCE = 1e-3
 """How often three pairs, one of them wrong, close a triangle."""
 _CLOSED = 0.98
 """How often three right pairs close one."""
+_AMONG_RIVALS = 0.5
+"""How often three pairs close one of which two have rivals: of a vase on a turntable every turn looks
+right, and the search takes the least of them each time, which agree."""
 _ROUNDS = 4
 _LARGEST_ODDS = 12.0
 """Log odds beyond which nothing speaks for or against a pair."""
@@ -74,7 +78,9 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
     graph = graph._replace(mask=looked_at)
     found = triangles(graph.source[looked_at], graph.reference[looked_at], count)
     found = np.flatnonzero(looked_at)[found]
-    posterior = _posterior(prior, found, triangle_errors(graph, found))
+    rivals = np.array([relation.rivals >= RIVAL for relation in relations], bool)
+    by_chance = np.where(rivals[found].sum(axis=1) >= 2, _AMONG_RIVALS, _BY_CHANCE)
+    posterior = _posterior(prior, found, triangle_errors(graph, found), by_chance)
     poses, errors = _robust_poses(graph, posterior, count)
     agrees = errors <= CHI_SQUARED
     posterior = _confirmed(graph, posterior, agrees, count)
@@ -131,7 +137,10 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
 
 
 def _posterior(
-    prior: Float[np.ndarray, "e"], found: Int[np.ndarray, "t 3"], error: Float[np.ndarray, "t"]
+    prior: Float[np.ndarray, "e"],
+    found: Int[np.ndarray, "t 3"],
+    error: Float[np.ndarray, "t"],
+    by_chance: Float[np.ndarray, "t"],
 ) -> Float[np.ndarray, "e"]:
     """The probability of every pair given which triangles close (a few rounds of belief)."""
     start = _log_odds(prior)
@@ -142,11 +151,11 @@ def _posterior(
         support, against = np.zeros_like(odds), np.zeros_like(odds)
         for k in range(3):
             others = chance[found[:, (k + 1) % 3]] * chance[found[:, (k + 2) % 3]]
-            right = others * _CLOSED + (1 - others) * _BY_CHANCE
-            said = np.where(closed, np.log(right / _BY_CHANCE), 0)
+            right = others * _CLOSED + (1 - others) * by_chance
+            said = np.where(closed, np.log(right / by_chance), 0)
             # Triangles that share pairs are no independent witnesses: the best two count.
             np.maximum.at(support, found[:, k], said)
-            doubt = np.where(closed, 0, np.log((1 - right) / (1 - _BY_CHANCE)))
+            doubt = np.where(closed, 0, np.log((1 - right) / (1 - by_chance)))
             np.add.at(against, found[:, k], doubt)
         # As many triangles speak against a right pair as wrong ones touch it; a wrong pair closes none.
         against = np.maximum(against, -8.0)
