@@ -74,6 +74,7 @@ def register_task(
         config,
         start=None if start is None else RigidTransform(start[:3, :3], start[:3, 3]),
         least=_HOPELESS,
+        thorough=False,
     )
     return Relation(
         task.source, task.reference, task.how, found.transformation, found.probability,

@@ -108,6 +108,18 @@ def test_unlikely_pairs_that_agree_confirm_each_other(seed):
     assert single.members() == ()
 
 
+def test_a_foreign_scan_that_fits_two_views_alike_is_refused(seed):
+    """Both show one thing, so it fits both in the same wrong way: two weak pairs that agree."""
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 7)
+    relations = ring(rng, truth, range(6))
+    weak = [relation(rng, truth, 6, k, probability=p) for k, p in ((0, 0.19), (1, 0.1))]
+    found = place([*relations, *weak], sizes(7))
+    assert found.members() == (tuple(range(6)),)
+    more = [relation(rng, truth, 6, k, probability=0.2) for k in range(5)]
+    assert place([*relations, *more], sizes(7)).members() == (tuple(range(7)),)
+
+
 def test_pairs_with_rivals_do_not_confirm_each_other(seed):
     """As of a vase, whose scans agree in every turn; beside pairs without rivals they do count."""
     rng = np.random.default_rng(seed)
