@@ -260,6 +260,22 @@ class Options:
     """Write benchmarks/results/sequences.json."""
 
 
+def write(rows: dict[str, dict]) -> None:
+    """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as they are."""
+    path = record.FOLDER / "sequences.json"
+    kept = json.loads(path.read_text("utf-8"))["rows"] if path.is_file() else {}
+    for name in VOXEL:
+        if name in kept or name in rows:
+            kept[name] = kept.get(name, {}) | rows.get(name, {})
+    record.write(
+        "sequences",
+        question="How many scans of whole sequences are placed?",
+        command=record.command("benchmarks.scans.sequences"),
+        columns=COLUMNS,
+        rows=kept,
+    )
+
+
 def main(options: Options) -> None:
     """Align every sequence and print a table."""
     root = data_root(options.data_root)
@@ -278,14 +294,8 @@ def main(options: Options) -> None:
             rows[name] |= {key: row[key] for key in ("scans", "expected")}
             rows[name] |= {f"{method}_{key}": row[key] for key in _FIGURES if key in row}
             print(method, rows[name], flush=True)
-    if options.record:
-        record.write(
-            "sequences",
-            question="How many scans of whole sequences are placed?",
-            command=record.command("benchmarks.scans.sequences"),
-            columns=COLUMNS,
-            rows=rows,
-        )
+        if options.record:
+            write(rows)
 
 
 if __name__ == "__main__":
