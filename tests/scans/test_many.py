@@ -120,8 +120,13 @@ def test_workers_give_the_same_bits_and_one_that_dies_costs_a_retry(scans, align
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bits(scans, alignment, tmp_path):
+@pytest.mark.float32
+def test_processes_and_a_dask_cluster_give_the_same_bits(scans, tmp_path):
+    """In float32: new processes have JAX as it is by default."""
     distributed = pytest.importorskip("distributed")
+    in_turn = register_many(scans[0], config=NARROW)
+    assert in_turn.groups == ((0, 1, 2, 3),)
+    assert_same(register_many(scans[0], config=NARROW, workers=2), in_turn)
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=None
@@ -130,7 +135,7 @@ def test_a_dask_cluster_gives_the_same_bits(scans, alignment, tmp_path):
     ):
         executor = client.get_executor()
         assert_same(
-            register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), alignment
+            register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), in_turn
         )
 
 
