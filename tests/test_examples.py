@@ -26,6 +26,14 @@ def test_calibrate_sensor_learns_the_offset_through_registration(capsys):
 
 @pytest.mark.slow
 @pytest.mark.float32
+def test_calibrate_mount_learns_the_mount_through_a_pose_graph(capsys):
+    example = runpy.run_path(str(EXAMPLES / "calibrate_mount.py"))
+    np.testing.assert_allclose(example["calibrate"](), example["TRUE"], atol=0.004)
+    assert "stations missed by 1.12" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.float32
 def test_implicit_gradient_is_that_of_the_iterations(capsys):
     example = runpy.run_path(str(EXAMPLES / "implicit_gradient.py"))
     unrolled, implicit = (np.asarray(example["influence"](g)) for g in ("unrolled", "implicit"))

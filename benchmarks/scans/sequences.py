@@ -32,7 +32,6 @@ VOXEL = {
     "bunny_turntable": 0.005,
     "redkitchen_frames": 0.05,
     "kitti00": 0.5,
-    "opencalib": 0.5,
 }
 """Metres, for Open3D."""
 _FRAGMENTS = "7scene/7-scenes-redkitchen"
@@ -49,7 +48,7 @@ class Sequence(NamedTuple):
 
 
 def sequence(root: Path, name: str) -> Sequence | None:
-    """A sequence by its name; None if it is not there."""
+    """A sequence by its name; None if it, or its true poses, are not there."""
     if name == "redkitchen":
         folder = root / _FRAGMENTS
         if not folder.is_dir():
@@ -59,7 +58,7 @@ def sequence(root: Path, name: str) -> Sequence | None:
         poses, expected = np.array([read_pose(path) for path in files]), np.ones(10, bool)
     else:
         folder = root / "scans" / name
-        if not folder.is_dir():
+        if not (folder / "poses.json").is_file():
             return None
         table = json.loads((folder / "poses.json").read_text())
         keys = sorted((k for k in table if (folder / f"scan_{k}.npz").is_file()), key=int)
@@ -233,18 +232,20 @@ def _open3d_start(count: int, edges) -> tuple[list[np.ndarray], np.ndarray]:
     return best
 
 
-COLUMNS = {
-    "scans": "scans",
-    "expected": "overlap another by .3",
-    "placed": "placed",
+_FIGURES = {
     "right": "placed right",
     "wrong": "placed wrong",
-    "median_deg": "median error, degrees",
-    "worst_deg": "largest, degrees",
+    "worst_deg": "largest error, deg",
     "worst_m": "largest, m",
-    "pairs": "pairs registered",
+    "median_deg": "median, deg",
+    "pairs": "pairs",
     "seconds": "s",
     "cpu_seconds": "processor s",
+}
+COLUMNS = {"scans": "scans", "expected": "overlap another by .3"} | {
+    f"{method}_{key}": f"{label}: {words}"
+    for method, label in (("jaxreg", "jaxreg"), ("open3d", "Open3D"))
+    for key, words in _FIGURES.items()
 }
 
 
@@ -259,6 +260,22 @@ class Options:
     """Write benchmarks/results/sequences.json."""
 
 
+def write(rows: dict[str, dict]) -> None:
+    """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as they are."""
+    path = record.FOLDER / "sequences.json"
+    kept = json.loads(path.read_text("utf-8"))["rows"] if path.is_file() else {}
+    for name in VOXEL:
+        if name in kept or name in rows:
+            kept[name] = kept.get(name, {}) | rows.get(name, {})
+    record.write(
+        "sequences",
+        question="How many scans of whole sequences are placed?",
+        command=record.command("benchmarks.scans.sequences"),
+        columns=COLUMNS,
+        rows=kept,
+    )
+
+
 def main(options: Options) -> None:
     """Align every sequence and print a table."""
     root = data_root(options.data_root)
@@ -271,17 +288,14 @@ def main(options: Options) -> None:
         if found is None:
             continue
         methods = {"jaxreg": jaxreg_row} | ({"open3d": open3d_row} if options.open3d else {})
+        rows[name] = {"label": name}
         for method, run in methods.items():
-            rows[f"{name}_{method}"] = {"label": f"{name}, {method}"} | run(found)
-            print(rows[f"{name}_{method}"], flush=True)
-    if options.record:
-        record.write(
-            "sequences",
-            question="How many scans of whole sequences are placed?",
-            command=record.command("benchmarks.scans.sequences"),
-            columns=COLUMNS,
-            rows=rows,
-        )
+            row = run(found)
+            rows[name] |= {key: row[key] for key in ("scans", "expected")}
+            rows[name] |= {f"{method}_{key}": row[key] for key in _FIGURES if key in row}
+            print(method, rows[name], flush=True)
+        if options.record:
+            write(rows)
 
 
 if __name__ == "__main__":

@@ -81,6 +81,8 @@ def optimize_poses(
     function theorem with the weights held; they need a converged result, so float64. There is none by
     `initial`.
     """
+    # Where some are numpy's, others must not be traced by numpy.
+    graph, initial = jax.tree.map(jnp.asarray, (graph, initial))
     count = initial.translation.shape[0]
     held = jnp.arange(count) == 0 if fixed is None else jnp.asarray(fixed)
     most = min(6 * count, 500) if cg_iterations is None else cg_iterations
@@ -165,10 +167,14 @@ def _implicit_step(graph, poses, held, weights, most: int):
         # What is held moves nothing, or the derivative would not be symmetric.
         return jnp.where(held, step, jax.grad(cost)(step))
 
-    def tangent_solve(linear, y):
+    def conjugate_gradients(linear, y):
         return jax.scipy.sparse.linalg.cg(
             linear, y, M=lambda x: se3.applied(inverses, x), tol=1e-12, maxiter=most
         )[0]
+
+    def tangent_solve(linear, y):
+        # Around `cg`, which itself puts its start and `y` in one operation, and is not transposed.
+        return jax.lax.custom_linear_solve(linear, y, conjugate_gradients, symmetric=True)
 
     zero = jnp.zeros_like(blocks.gradient)
     step = jax.lax.custom_root(slope, zero, lambda _, start: start, tangent_solve)

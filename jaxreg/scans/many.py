@@ -242,7 +242,9 @@ class _Run(NamedTuple):
         for k, other in enumerate(self.relations):
             if (other.source, other.reference) == (relation.source, relation.reference):
                 if relation.probability > other.probability or other.how == "search":
-                    self.relations[k] = relation
+                    # A pose that is given has no rival, which is not the same as having none.
+                    rivals = max(relation.rivals, other.rivals)
+                    self.relations[k] = dataclasses.replace(relation, rivals=rivals)
                 return
         self.relations.append(relation)
 
@@ -279,26 +281,12 @@ def _first_pairs(run: _Run, likeness: np.ndarray, order: str) -> list[Task]:
     count = len(run.prepared)
     if order == "sequence":
         pairs = {(k, k + step) for step in (1, 2) for k in range(count - step)}
-        pairs |= _alike(likeness, 2, set())
+        pairs |= proposals.most_alike(likeness, 2)
     elif count <= _ALL_PAIRS:
         pairs = {(i, j) for j in range(count) for i in range(j)}
     else:
-        pairs = _alike(likeness, _NEAREST, set())
+        pairs = proposals.most_alike(likeness, _NEAREST)
     return _tasks(pairs - set(run.tried()), "search")
-
-
-def _alike(likeness: np.ndarray, most: int, but: set[tuple[int, int]]) -> set[tuple[int, int]]:
-    """For every scan the `most` that are most like it, of the pairs that are not in `but`."""
-    score = likeness.copy()
-    np.fill_diagonal(score, -np.inf)
-    for i, j in but:
-        score[i, j] = score[j, i] = -np.inf
-    return {
-        _pair(i, int(j))
-        for i in range(len(score))
-        for j in np.argsort(-score[i], kind="stable")[:most]
-        if np.isfinite(score[i, j])
-    }
 
 
 def _from_starts(run: _Run, starts: list[np.ndarray | None]) -> list[Task]:

@@ -101,16 +101,19 @@ def register_prepared(
     scale: bool = False,
     max_rotation_deg: float | None = None,
     least: float = 0.0,
+    thorough: bool = True,
 ) -> ScanRegistration:
     """`register` of clouds that were prepared with `config`, or with another that differs in `wide`.
 
-    A pose whose probability is below `least` after the search is left as the search had it.
+    A pose whose probability is below `least` after the search is left as the search had it. Unless it
+    is `thorough`, no cause is looked for where a pose does not fit, and all points are looked at only
+    if the pose is likely: of many scans most pairs are wrong, and others tell which.
     """
     known = known or Known(max_rotation_deg=max_rotation_deg or 180.0)
     if flat := planar.is_planar(source, reference):
         known = known._replace(up=planar.UP)
     if not scale:
-        return _of_one_size(source, reference, config, start, known, least)
+        return _of_one_size(source, reference, config, start, known, least, thorough)
     if few.is_few(source, reference):
         raise ValueError("scale=True needs surfaces, clouds of more than 60 points: leave it out.")
     return similar.registered(source, reference, config, start, known, run=_of_one_size, flat=flat)
@@ -123,6 +126,7 @@ def _of_one_size(
     start: RigidTransform | None,
     known: Known,
     least: float = 0.0,
+    thorough: bool = True,
 ) -> ScanRegistration:
     """Every kind of pair has a module of its own; here one is chosen."""
     if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
@@ -131,7 +135,9 @@ def _of_one_size(
         return planar.registered(source, reference, config, start, known)
     if known.inside:
         return inside.registered(source, reference, config, start, (), known)
-    found = surfaces.registered(source, reference, config, start, known, least=least)
+    found = surfaces.registered(
+        source, reference, config, start, known, least=least, thorough=thorough
+    )
     if found.success or found.probability < least or not inside.is_possible(source, reference):
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))

@@ -16,6 +16,7 @@ from jaxreg.graph.pose_graph import CHI_SQUARED, PoseGraph, squared_errors
 from jaxreg.graph.sparse import pose_covariances, solve_poses
 from jaxreg.graph.trees import components, spanning_tree, tree_poses, triangle_errors, triangles
 from jaxreg.scans.relation import Relation
+from jaxreg.scans.verdict import RIVAL
 from jaxreg.types import RigidTransform
 
 SURE = 0.9
@@ -25,11 +26,15 @@ _CONSIDERED = 0.02
 _MODEL = 0.3
 """What scans of one place differ by beyond their noise (moved things, bent depth, a moving sensor), in
 reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
-_BY_CHANCE = 1e-3
-"""How often three pairs, one of them wrong, close a triangle."""
+_BY_CHANCE = 0.05
+"""How often three pairs, one of them wrong, close a triangle. A foreign scan that fits one view of a
+thing fits the next view in the same wrong way, so it is not seldom."""
 _CLOSED = 0.98
 """How often three right pairs close one."""
-_ROUNDS = 4
+_AMONG_RIVALS = 0.5
+"""How often three pairs close one of which two have rivals: of a vase on a turntable every turn looks
+right, and the search takes the least of them each time, which agree."""
+_ROUNDS = 8
 _LARGEST_ODDS = 12.0
 """Log odds beyond which nothing speaks for or against a pair."""
 
@@ -74,7 +79,9 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
     graph = graph._replace(mask=looked_at)
     found = triangles(graph.source[looked_at], graph.reference[looked_at], count)
     found = np.flatnonzero(looked_at)[found]
-    posterior = _posterior(prior, found, triangle_errors(graph, found))
+    rivals = np.array([relation.rivals >= RIVAL for relation in relations], bool)
+    by_chance = np.where(rivals[found].sum(axis=1) >= 2, _AMONG_RIVALS, _BY_CHANCE)
+    posterior = _posterior(prior, found, triangle_errors(graph, found), by_chance)
     poses, errors = _robust_poses(graph, posterior, count)
     agrees = errors <= CHI_SQUARED
     posterior = _confirmed(graph, posterior, agrees, count)
@@ -131,7 +138,10 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
 
 
 def _posterior(
-    prior: Float[np.ndarray, "e"], found: Int[np.ndarray, "t 3"], error: Float[np.ndarray, "t"]
+    prior: Float[np.ndarray, "e"],
+    found: Int[np.ndarray, "t 3"],
+    error: Float[np.ndarray, "t"],
+    by_chance: Float[np.ndarray, "t"],
 ) -> Float[np.ndarray, "e"]:
     """The probability of every pair given which triangles close (a few rounds of belief)."""
     start = _log_odds(prior)
@@ -139,19 +149,29 @@ def _posterior(
     closed = error <= CHI_SQUARED
     for _ in range(_ROUNDS):
         chance = 1 / (1 + np.exp(-odds))
-        support, against = np.zeros_like(odds), np.zeros_like(odds)
+        said, doubt = np.zeros(found.shape), np.zeros(found.shape)
         for k in range(3):
             others = chance[found[:, (k + 1) % 3]] * chance[found[:, (k + 2) % 3]]
-            right = others * _CLOSED + (1 - others) * _BY_CHANCE
-            said = np.where(closed, np.log(right / _BY_CHANCE), 0)
-            # Triangles that share pairs are no independent witnesses: the best two count.
-            np.maximum.at(support, found[:, k], said)
-            doubt = np.where(closed, 0, np.log((1 - right) / (1 - _BY_CHANCE)))
-            np.add.at(against, found[:, k], doubt)
+            right = others * _CLOSED + (1 - others) * by_chance
+            said[:, k] = np.where(closed, np.log(right / by_chance), 0)
+            doubt[:, k] = np.where(closed, 0, np.log((1 - right) / (1 - by_chance)))
+        # Triangles that share pairs are no independent witnesses: the best two count.
+        support = _sum_of_largest_two(found.ravel(), said.ravel(), len(odds))
+        against = np.bincount(found.ravel(), doubt.ravel(), len(odds)).astype(np.float64)
         # As many triangles speak against a right pair as wrong ones touch it; a wrong pair closes none.
         against = np.maximum(against, -8.0)
         odds = (odds + np.clip(start + support + against, -_LARGEST_ODDS, _LARGEST_ODDS)) / 2
     return 1 / (1 + np.exp(-odds))
+
+
+def _sum_of_largest_two(
+    index: Int[np.ndarray, "k"], values: Float[np.ndarray, "k"], count: int
+) -> Float[np.ndarray, "c"]:
+    """For each of `count` indices the sum of its two largest values, 0 where there is none."""
+    order = np.lexsort([-values, index])
+    index, values = index[order], values[order]
+    rank = np.arange(len(index)) - np.searchsorted(index, index)
+    return np.bincount(index[rank < 2], values[rank < 2], count).astype(np.float64)
 
 
 def _log_odds(probability: np.ndarray) -> np.ndarray:
@@ -183,15 +203,15 @@ def _tree(graph: PoseGraph, edges, posterior, roots, count: int) -> RigidTransfo
 
 
 def _confirmed(graph: PoseGraph, posterior, agrees, count: int) -> np.ndarray:
-    """Pairs that agree with the poses that others give are as sure as these; the rest is not.
+    """Pairs that agree with the poses that sure ones give are as sure as these.
 
     A pair that is the only one between two parts agrees in any case, which says nothing.
     """
-    strong = graph.mask & agrees & (posterior >= 0.5)
-    bridge = _bridges(graph, strong, count)
-    sure = agrees & graph.mask & ~bridge
-    label = components(count, graph.source[strong & ~bridge], graph.reference[strong & ~bridge])
-    inside = sure & (label[graph.source] == label[graph.reference])
+    agreeing = graph.mask & agrees
+    sure = agreeing & (posterior >= SURE)
+    label = components(count, graph.source[sure], graph.reference[sure])
+    inside = agreeing & ~_bridges(graph, sure, count)
+    inside &= label[graph.source] == label[graph.reference]
     return np.where(
         inside,
         np.maximum(posterior, 0.99),

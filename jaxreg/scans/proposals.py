@@ -29,6 +29,14 @@ def likeness(prepared: list[Prepared]) -> Float[np.ndarray, "n n"]:
     return score
 
 
+def most_alike(likeness: Float[np.ndarray, "n n"], most: int) -> set[tuple[int, int]]:
+    """For every scan the `most` that are most like it: pairs (i, j), i < j."""
+    others = likeness.copy()
+    np.fill_diagonal(others, -np.inf)
+    order = np.argsort(-others, axis=1, kind="stable")[:, : min(most, len(others) - 1)]
+    return {(min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row}
+
+
 def _features(prepared: list[Prepared]) -> list[np.ndarray]:
     unit = in_steps(2 * float(np.median([cloud.radius for cloud in prepared])))
     found = []

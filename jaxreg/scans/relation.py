@@ -21,7 +21,7 @@ from jaxreg.types import RigidTransform
 How = Literal["search", "wide search", "start"]
 _KEPT_IN_MEMORY = 64
 """Prepared scans that a worker keeps."""
-_FORMAT = 1
+_FORMAT = 2
 _HOPELESS = 0.05
 """A pose of a smaller probability is not refined: it would take as long as the search."""
 
@@ -39,7 +39,8 @@ class Task(NamedTuple):
 class Relation:
     """The registration of scan `source` to scan `reference` (numbers of scans), of `ScanRegistration`.
 
-    `how` tells what found it. `covariance` is about the centroid of the reference.
+    `how` tells what found it. `covariance` is about the centroid of the reference. `rivals` is the
+    probability that another pose that was found is right.
     """
 
     source: int
@@ -52,6 +53,7 @@ class Relation:
     overlap: float
     max_correspondence_distance: float
     covariance: Float[np.ndarray, "6 6"]
+    rivals: float = 0.0
 
     @property
     def transform(self) -> RigidTransform:
@@ -72,11 +74,12 @@ def register_task(
         config,
         start=None if start is None else RigidTransform(start[:3, :3], start[:3, 3]),
         least=_HOPELESS,
+        thorough=False,
     )
     return Relation(
         task.source, task.reference, task.how, found.transformation, found.probability,
         found.success, found.reason, found.overlap, found.max_correspondence_distance,
-        found.covariance,
+        found.covariance, sum(other.probability for other in found.alternatives),
     )  # fmt: skip
 
 
@@ -151,6 +154,7 @@ def _from_record(values: dict[str, Any], task: Task) -> Relation:
         bool(values["success"]), str(values["reason"]), float(values["overlap"]),
         float(values["max_correspondence_distance"]),
         np.full((6, 6), np.nan) if covariance is None else np.array(covariance, np.float64),
+        float(values["rivals"]),
     )  # fmt: skip
     if found.transformation.shape != (4, 4) or not math.isfinite(found.probability):
         raise ValueError

@@ -100,15 +100,14 @@ def registered(
     known: Known,
     *,
     least: float = 0.0,
+    thorough: bool = True,
 ) -> ScanRegistration:
-    """The registration of two scans of surfaces.
-
-    A pose whose probability is below `least` after the search is left as the search had it.
-    """
+    """The registration of two scans of surfaces; `least` and `thorough` as of `register_prepared`."""
     problem = pose_problem(source, reference, config, known)
     if start is None:
-        return finished(problem, searched(problem), least=least)
-    return finished(problem, Found(frame.transform_in(problem.where, start), ()))
+        return finished(problem, searched(problem), least=least, thorough=thorough)
+    found = Found(frame.transform_in(problem.where, start), ())
+    return finished(problem, found, thorough=thorough)
 
 
 def pose_problem(
@@ -257,7 +256,7 @@ class _Closing(NamedTuple):
         return (f"{moved:.0%} of the points moved or changed: the pose rests on the others",)
 
 
-def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
+def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Closing:
     """The last stage where parts have moved; where that is not why points disagree, the cause."""
     source, reference = problem.source, problem.reference
     pose = in_unit(refined.transform, float(problem.where.length))
@@ -272,7 +271,8 @@ def _with_all_points(problem: Problem, refined: Refined) -> _Closing:
         settled = settled if settled.better or weights is not None else None
     if settled is not None:
         pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
-    return _Closing(settled, _another_cause(problem, pose, now) if now.suspicious else "")
+    asked = causes and now.suspicious
+    return _Closing(settled, _another_cause(problem, pose, now) if asked else "")
 
 
 def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
@@ -291,13 +291,16 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
     return ""
 
 
-def finished(problem: Problem, found: Found, *, least: float = 0.0) -> ScanRegistration:
+def finished(
+    problem: Problem, found: Found, *, least: float = 0.0, thorough: bool = True
+) -> ScanRegistration:
     """The chosen pose refined, looked at with all points, and judged beside the others."""
     if found.probability < least:
         refined, closing = unrefined(found.pose), _Closing()
     else:
-        refined = refine_pose(problem, found.pose)
-        closing = _with_all_points(problem, refined)
+        refined, closing = refine_pose(problem, found.pose), _Closing()
+        if thorough or found.probability >= verdict.TRUSTED:
+            closing = _with_all_points(problem, refined, causes=thorough)
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause
     covariance = problem.known.conditional(_covariance(refined.uncertainty, length))

@@ -84,3 +84,18 @@ def test_truncated_weights_go_from_all_to_in_or_out():
         np.testing.assert_allclose(
             truncated_weights(squared, threshold, control), expected, atol=2e-5
         )
+
+
+@pytest.mark.slow
+def test_reverse_derivatives_are_those_forward(problem):
+    """Of a graph whose other arrays are numpy's, as a program has it that learns the transforms."""
+    graph, start, _ = problem
+
+    def far(scale):
+        transform = se3.composed(graph.transform, se3.exp(scale * direction()))
+        found = optimize_poses(graph._replace(transform=transform), start, iterations=8)
+        return jnp.sum(found.poses.translation[2:] ** 2)
+
+    forward, backward = (jax.jit(derivative(far))(0.1) for derivative in (jax.jacfwd, jax.grad))
+    np.testing.assert_allclose(backward, forward, rtol=1e-9)
+    assert abs(backward) > 1e-3

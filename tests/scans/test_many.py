@@ -16,6 +16,7 @@ from jaxreg.scans.prepare import prepare
 
 TABLE, PLANT = 9, 22
 NARROW = RegisterConfig(wide=None)
+FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +121,14 @@ def test_workers_give_the_same_bits_and_one_that_dies_costs_a_retry(scans, align
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bits(scans, alignment, tmp_path):
+@pytest.mark.float32
+def test_processes_and_a_dask_cluster_give_the_same_bits(scans, tmp_path, monkeypatch):
+    """In float32: new processes have JAX as it is by default, but for the flags of the tests."""
     distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("XLA_FLAGS", FLAGS)
+    in_turn = register_many(scans[0], config=NARROW)
+    assert in_turn.groups == ((0, 1, 2, 3),)
+    assert_same(register_many(scans[0], config=NARROW, workers=2), in_turn)
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=None
@@ -130,7 +137,7 @@ def test_a_dask_cluster_gives_the_same_bits(scans, alignment, tmp_path):
     ):
         executor = client.get_executor()
         assert_same(
-            register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), alignment
+            register_many(scans[0], config=NARROW, executor=executor, work=tmp_path), in_turn
         )
 
 

@@ -1,5 +1,7 @@
 """Which pairs are believed, and where scans are put: made-up registrations whose truth is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -104,6 +106,32 @@ def test_unlikely_pairs_that_agree_confirm_each_other(seed):
     assert found.members() == (tuple(range(6)),)
     single = place([relation(rng, truth, 1, 0, probability=0.6)], sizes(2))
     assert single.members() == ()
+
+
+def test_a_foreign_scan_that_fits_two_views_alike_is_refused(seed):
+    """Both show one thing, so it fits both in the same wrong way: two weak pairs that agree."""
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 7)
+    relations = ring(rng, truth, range(6))
+    weak = [relation(rng, truth, 6, k, probability=p) for k, p in ((0, 0.19), (1, 0.1))]
+    found = place([*relations, *weak], sizes(7))
+    assert found.members() == (tuple(range(6)),)
+    more = [relation(rng, truth, 6, k, probability=0.2) for k in range(5)]
+    assert place([*relations, *more], sizes(7)).members() == (tuple(range(7)),)
+
+
+def test_pairs_with_rivals_do_not_confirm_each_other(seed):
+    """As of a vase, whose scans agree in every turn; beside pairs without rivals they do count."""
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 6)
+    vase = ring(rng, truth, range(6), probability=0.25)
+    assert place(vase, sizes(6)).members() == (tuple(range(6)),)
+    vase = [dataclasses.replace(r, rivals=0.7) for r in vase]
+    found = place(vase, sizes(6))
+    assert found.members() == ()
+    assert found.posterior.max() < 0.5
+    anchored = [*vase[:1], *ring(rng, truth, range(6))[1:]]
+    assert place(anchored, sizes(6)).used[0]
 
 
 def test_one_sure_pair_is_enough_and_says_how_sure(seed):
