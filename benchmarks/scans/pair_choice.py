@@ -4,8 +4,7 @@
 
 `register_many` tries each scan first with the few that look most like it, by descriptors that it has
 anyway. With ever more partners: the share of all pairs that are tried, the share found of the pairs that
-overlap by .3 in truth, and the share of the scans that hang together by them. Drawn by
-`python -m benchmarks.figures --only pair_choice`.
+overlap by .3 in truth, and the share of the scans that hang together by them.
 """
 
 import dataclasses

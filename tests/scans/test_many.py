@@ -17,6 +17,7 @@ from jaxreg.scans.prepare import prepare
 TABLE, PLANT = 9, 22
 NARROW = RegisterConfig(wide=None)
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""Those of tests/conftest.py, for processes that a test starts."""
 
 
 @pytest.fixture(scope="module")
