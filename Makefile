@@ -15,7 +15,7 @@ demo: $(VENV)/.installed  ## train on procedural shapes, evaluate, draw a pair (
 	$(BIN)/python train.py configs/synthetic_cpu.toml --workdir runs/demo
 	$(BIN)/python evaluate.py configs/synthetic_cpu.toml --checkpoint runs/demo --picture runs/demo/pair.png
 
-test: $(VENV)/.installed-dev  ## run the tests (about 20 minutes, 2 cores)
+test: $(VENV)/.installed-dev  ## run the tests (8 minutes, 2 cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow" --durations=10
 
 coverage: $(VENV)/.installed-dev  ## the same, and which lines they miss (a quarter slower)

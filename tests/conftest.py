@@ -81,6 +81,11 @@ def pytest_configure(config):
         config.option.seed = str(random.SystemRandom().randrange(2**31))
 
 
+def pytest_collection_modifyitems(items):
+    """The longest test begins first: at the end a worker would be alone with it."""
+    items.sort(key=lambda item: "test_readme" not in item.nodeid)
+
+
 def pytest_report_header(config):
     seed = config.getoption("--seed") or "one of each test's name"
     return f"seed: {seed}; data: {_data() or 'none'}"
