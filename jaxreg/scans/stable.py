@@ -32,6 +32,9 @@ _STAYED, _MOVED = 1.25, 2.0
 _GAIN = 1.02
 """A pose is taken if so many times as many points agree with it: lie within one noise level. Within
 three a pose that was drawn along a little agrees about as well as the right one."""
+_STEP = 0.1
+"""The noise is at least so many widths of a patch: exact points have none, but curved surfaces between
+them are no planes, and would be said to have moved."""
 _LEAST = 1e-9
 
 
@@ -71,7 +74,7 @@ def settled(
     few, many = _rows(source, _FIRST), _rows(source, _SECOND)
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
     given = np.ones(len(source.points)) if known.weights is None else known.weights
-    noise = _noise(source, reference)
+    noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
     around = np.asarray(cKDTree(second).query(second, k=min(_AROUND, len(second)), workers=-1)[1])
@@ -80,7 +83,7 @@ def settled(
     stays = given[many]
     for _ in range(_ROUNDS):
         found = planes.fitted(second, whole, found.pose, np.zeros(0), **at)
-        noise = max(_core(found.off[found.over & (given[many] > 0)]), _LEAST)
+        noise = max(_core(found.off[found.over & (given[many] > 0)]), least)
         stays = given[many] * _stayed(found.off, around, noise)
         found = planes.fitted(second, whole, found.pose, noise * narrow, weights=stays, **at)
     wider = planes.fitted(second, whole, found.pose, 1.5 * noise * narrow[-1:], weights=stays, **at)
@@ -102,13 +105,15 @@ def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
     return np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int)
 
 
-def _noise(source: Prepared, reference: Prepared) -> float:
-    """The median thickness of small pieces of surface, in radii of the reference; of both clouds."""
-    levels = []
+def _noise(source: Prepared, reference: Prepared) -> tuple[float, float]:
+    """The median thickness of pieces of surface, and the least it is taken for; radii of the reference."""
+    levels, widths = [], []
     for cloud in (source, reference):
         found = planes.patches(cloud.points, cloud.tree, cloud.points[_rows(cloud, _FIRST)])
         levels.append(np.median(found.noise) * cloud.radius / reference.radius)
-    return max(float(np.hypot(*levels)), _LEAST)
+        widths.append(np.median(found.width) * cloud.radius / reference.radius)
+    least = max(_STEP * float(max(widths)), _LEAST)
+    return max(float(np.hypot(*levels)), least), least
 
 
 def _stayed(

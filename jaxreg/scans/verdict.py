@@ -17,6 +17,9 @@ RIVAL = 0.25
 _VOLUME = 0.185
 """Median surface variation of points that fill a volume: 0.19 to 0.22 in a cube; surfaces have less,
 and of thin parts up to 0.19 (docs/notes/0037)."""
+_ANY_WAY = 0.4
+"""And normals mean nothing there: .5 to .6 of the near points disagree under the right pose of a filled
+volume, .3 at most of a thin wall that is seen from both sides, whose points lie as near each other."""
 _COPIED = 0.5
 """Where so many points coincide it does not matter what they fill."""
 _LEAST_HELD = 1e-5
@@ -57,7 +60,7 @@ def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | 
 
 def in_a_volume(found: Evidence, *clouds: Examined) -> str:
     """A sentence if the points fill a volume, where overlap alone speaks for a pose; else nothing."""
-    if found.same >= _COPIED or not fills_volume(*clouds):
+    if found.same >= _COPIED or found.disagreement < _ANY_WAY or not fills_volume(*clouds):
         return ""
     return "The points fill a volume, where any pose overlaps: there is no surface to judge by."
 
