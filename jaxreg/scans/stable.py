@@ -106,7 +106,7 @@ def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
 
 
 def _noise(source: Prepared, reference: Prepared) -> tuple[float, float]:
-    """The median thickness of pieces of surface, and the least it is taken for; radii of the reference."""
+    """The median thickness of pieces of surface and its floor, in radii of the reference."""
     levels, widths = [], []
     for cloud in (source, reference):
         found = planes.patches(cloud.points, cloud.tree, cloud.points[_rows(cloud, _FIRST)])
