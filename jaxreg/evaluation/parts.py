@@ -7,8 +7,9 @@ all of them there has the whole.
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from jaxreg.io.arrays import read_arrays
 from jaxreg.types import RigidTransform
 
 _WHAT = "evaluation.json"
+_ARRAYS = ("rotation", "translation", "true_rotation", "true_translation", "seconds")
 
 
 class Registered(NamedTuple):
@@ -50,7 +52,7 @@ class Parts(NamedTuple):
         self.folder.mkdir(parents=True, exist_ok=True)
         place, text = self.folder / _WHAT, json.dumps(what, indent=1, default=str) + "\n"
         if not place.exists():
-            self._write(place, text.encode())
+            self._write(place, lambda file: file.write(text.encode()))
         elif place.read_text(encoding="utf-8") != text:
             raise ValueError(
                 f"{self.folder} holds parts of another evaluation ({place} says which): give another "
@@ -68,19 +70,14 @@ class Parts(NamedTuple):
 
     def keep(self, number: int, found: Registered) -> None:
         """Write a batch, whole or not at all."""
-        names = ("rotation", "translation", "true_rotation", "true_translation", "seconds")
-        arrays = (*found.predicted, *found.truth, np.asarray(found.seconds))
-        temporary = self._temporary(self._place(number))
-        with temporary.open("wb") as file:
-            np.savez(file, **dict(zip(names, arrays, strict=True)))
-        os.replace(temporary, self._place(number))
+        values = (*found.predicted, *found.truth, np.asarray(found.seconds))
+        arrays = dict(zip(_ARRAYS, values, strict=True))
+        self._write(self._place(number), lambda file: np.savez(file, **arrays))
 
     def kept(self, number: int) -> Registered:
         """A batch that is there."""
-        names = ("rotation", "translation", "true_rotation", "true_translation", "seconds")
-        remedy = "delete it, and run again"
-        arrays = read_arrays(self._place(number), names, remedy=remedy)
-        rotation, translation, *truth, seconds = (arrays[name] for name in names)
+        arrays = read_arrays(self._place(number), _ARRAYS, remedy="delete it, and run again")
+        rotation, translation, *truth, seconds = (arrays[name] for name in _ARRAYS)
         return Registered(
             RigidTransform(rotation, translation), RigidTransform(*truth), float(seconds)
         )
@@ -88,9 +85,8 @@ class Parts(NamedTuple):
     def _place(self, number: int) -> Path:
         return self.folder / f"batch_{number:06d}.npz"
 
-    def _temporary(self, place: Path) -> Path:
-        return place.with_name(f".{place.name}.{self.number}")
-
-    def _write(self, place: Path, content: bytes) -> None:
-        self._temporary(place).write_bytes(content)
-        os.replace(self._temporary(place), place)
+    def _write(self, place: Path, save: Callable[[BinaryIO], Any]) -> None:
+        temporary = place.with_name(f".{place.name}.{self.number}")
+        with temporary.open("wb") as file:
+            save(file)
+        os.replace(temporary, place)

@@ -19,10 +19,8 @@ _GLANCE, _SAMPLE = 500, 4000
 """Points of the source that are compared: at first, and where these are suspicious."""
 _OFF = 8.0
 """A point this many noise levels from the other surface is off it."""
-_STEP = 0.1
-"""The noise is at least so many spacings: exact points have none, but their poses are never exact."""
 _LEAST = 0.02
-"""And so many, where the typical distance is looked at."""
+"""The noise is at least so many widths of a patch where the typical distance is looked at."""
 _ENOUGH, _SUSPECT = 0.8, 0.03
 """If so many points can be compared and so many of them are off, the causes are looked for, which takes
 seconds. Of right poses of real scans (docs/notes/0045) those that overlap less often have as many off,
@@ -81,7 +79,7 @@ def agreement(
     patches = _patches(reference, moved)
     off, beside = planes.offsets(moved, patches)
     noise, typical = np.hypot(scale * noise, patches.noise), float(np.median(patches.width))
-    floored = np.maximum(noise, _STEP * typical)
+    floored = np.maximum(noise, planes.FLOOR * typical)
     over = _over(off, beside, patches, floored)
     if not over.any():
         return Agreement(0.0, 0.0, 0.0)
@@ -107,7 +105,7 @@ def at_another_size(
     """
     some, noise = _sampled(source, _SAMPLE)
     unit = reference.radius
-    narrowest = min(3 * float(np.median(noise)) + _STEP * reach, reach)
+    narrowest = min(3 * float(np.median(noise)) + planes.FLOOR * reach, reach)
     found = planes.fitted(
         some / unit,
         (reference.points, reference.tree),

@@ -17,6 +17,9 @@ NEIGHBORS = 12
 """Points of a patch of surface."""
 TUKEY = 4.685
 """Where Tukey's kernel ends, in standard deviations, for nearly all that normal errors tell."""
+FLOOR = 0.1
+"""The noise is taken for at least so many widths of a patch: exact points have none, but poses are
+never exact, and curved surfaces are no planes."""
 _WITHIN = 3.0
 """A point lies over its patch if it is at most this many widths from the middle, along the plane."""
 _FEWEST = 20

@@ -32,9 +32,6 @@ _STAYED, _MOVED = 1.25, 2.0
 _GAIN = 1.02
 """A pose is taken if so many times as many points agree with it: lie within one noise level. Within
 three a pose that was drawn along a little agrees about as well as the right one."""
-_STEP = 0.1
-"""The noise is at least so many widths of a patch: exact points have none, but curved surfaces between
-them are no planes, and would be said to have moved."""
 _LEAST = 1e-9
 
 
@@ -112,7 +109,7 @@ def _noise(source: Prepared, reference: Prepared) -> tuple[float, float]:
         found = planes.patches(cloud.points, cloud.tree, cloud.points[_rows(cloud, _FIRST)])
         levels.append(np.median(found.noise) * cloud.radius / reference.radius)
         widths.append(np.median(found.width) * cloud.radius / reference.radius)
-    least = max(_STEP * float(max(widths)), _LEAST)
+    least = max(planes.FLOOR * float(max(widths)), _LEAST)
     return max(float(np.hypot(*levels)), least), least
 
 

@@ -22,26 +22,19 @@ MODULES = {
 NAMES = {
     "jaxreg.compilation.jit": "jax.jit",
     "jaxreg.config.RegisterConfig": "jaxreg.scans.config.RegisterConfig",
+    "jaxreg.evaluation.true_transforms": "jaxreg.data.batches.true_transforms",
     "jaxreg.dense.register_dense": "jaxreg.search.pipeline.register_global",
     "jaxreg.judge.evidence.Evidence": "jaxreg.judge.evidence.Evidence",
     "jaxreg.refine.gicp.gicp": "jaxreg.refine.gicp.gicp",
     "jaxreg.refine.host.refine": "jaxreg.refine.host.refine_on_host",
     "jaxreg.refine.icp.icp": "jaxreg.refine.point_to_point.icp",
     "jaxreg.scans.pair.register": "jaxreg.scans.pair.register",
+    "jaxreg.scoring.pair_stream": "jaxreg.evaluation.score.pair_stream",
     "jaxreg.training.load_checkpoint": "jaxreg.weights.checkpoint.load_checkpoint",
 }
 """What was called so: what it is called today. The same name twice: its arguments changed."""
 SETTINGS = ("iterations", "trim")
 """Arguments that are fields of `config` today."""
-
-
-def true_transforms(batches):
-    """The true transforms of pairs, stacked: once in `jaxreg.evaluation`, today in nobody's way."""
-    import jax
-    import numpy as np
-
-    parts = [jax.tree.map(lambda x, c=n: np.array(x)[:c], pair.transform) for pair, n in batches]
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def _method(function):
@@ -88,6 +81,17 @@ def _registering(register):
     return former
 
 
+def _counted(pair_stream):
+    """`pair_stream`, which once returned the number of pairs and all batches."""
+
+    @functools.wraps(pair_stream)
+    def former(*arguments, **given):
+        stream = pair_stream(*arguments, **given)
+        return stream.count, stream.batches()
+
+    return former
+
+
 def _with_gap(evidence):
     """The evidence for a pose, whose distance of the surfaces was once called the gap."""
     evidence.gap = property(lambda found: found.distance)
@@ -100,8 +104,9 @@ _ADAPTED = {
     "jaxreg.refine.gicp.gicp": _method,
     "jaxreg.refine.icp.icp": _method,
     "jaxreg.scans.pair.register": _registering,
+    "jaxreg.scoring.pair_stream": _counted,
 }
-_TOUCHED = {name.rpartition(".")[0] for name in NAMES} | {"jaxreg.evaluation", *MODULES}
+_TOUCHED = {name.rpartition(".")[0] for name in NAMES} | MODULES.keys()
 
 
 def today(former: str) -> object:
@@ -121,8 +126,8 @@ def _with_former_names(module: ModuleType) -> None:
         former = f"{module.__name__}.{name}"
         if former in NAMES:
             return today(former)
-        if former == "jaxreg.evaluation.true_transforms":
-            return true_transforms
+        if module.__name__ in MODULES:
+            return getattr(importlib.import_module(MODULES[module.__name__]), name)
         raise AttributeError(f"module '{module.__name__}' has no attribute '{name}'")
 
     module.__getattr__ = lookup
@@ -151,11 +156,8 @@ class FormerNames(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         """An empty one."""
 
     def exec_module(self, module):
-        """Nothing but former names, or today's module in the place of this one."""
-        if module.__name__ in MODULES:
-            sys.modules[module.__name__] = importlib.import_module(MODULES[module.__name__])
-        else:
-            _with_former_names(module)
+        """Nothing but former names, and those of the module that is in its place today."""
+        _with_former_names(module)
 
 
 sys.meta_path.insert(0, FormerNames())
