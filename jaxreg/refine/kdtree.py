@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.spatial.transform import Rotation
 
 from jaxreg._xla import from_host
 from jaxreg.geometry.clouds import padded_size
@@ -30,6 +31,9 @@ _COARSE = 30_000
 _FAR = 2e-3
 """Steps longer than this (radians, radii of the clouds) lead to a pose that a narrower kernel
 misses."""
+_PARALLEL, _LONGEST = 0.8, 4.0
+"""A step is extrapolated where the cosine to the last one is at least the first, up to so many
+times its length."""
 _SMALLEST = 512
 """Smallest padded size: below, one more compilation costs more than the padding."""
 
@@ -111,9 +115,9 @@ def iterate(
 
     The kernel narrows to its final width. After a step below `config.tolerance` half of the
     remaining widths are skipped; at the final width all are. Up to `more` further iterations are
-    made where the pose still moves: far at a wide kernel, at all at the final one. Only every
-    `step`-th point looks for a partner; large clouds first converge with fewer. `motions` is a basis of
-    the unknown motions (rotation vector, translation) in the frame; None: all of them.
+    made where the pose still moves: far at a wide kernel, at all at the final one. There steps are
+    extrapolated. Only every `step`-th point looks for a partner; large clouds first converge with
+    fewer. `motions` is a basis of the unknown motions (rotation vector, translation) in the frame; None: all of them.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)
@@ -126,7 +130,7 @@ def iterate(
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     taken, converged, pairs = 0, False, None
     for stride, widths in levels:
-        i, converged, spare = 0, False, more
+        i, converged, spare, last = 0, False, more, None
         while i < len(widths) and not converged:
             pairs = tree_pairs(
                 pose,
@@ -143,7 +147,10 @@ def iterate(
             new = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), new)
             change = _change(pose, new)
             still = change < config.tolerance
-            pose, taken, converged = new, taken + 1, bool(still and widths[i] == 1)
+            converged = bool(still and widths[i] == 1)
+            if widths[i] == 1 and not converged:
+                new, last = _extrapolated(pose, new, last)
+            pose, taken = new, taken + 1
             # From a wider kernel at least to the next one, at most to the last.
             halfway = min((i + config.iterations) // 2, config.iterations - 1)
             moving = change > _FAR or (i == len(widths) - 1 and not still)
@@ -269,6 +276,28 @@ def _surface(shape, config: RefineConfig):
     if config.method == "gicp":
         return surface_covariances(across, config.epsilon, ends if config.edges else None)
     return across
+
+
+def _extrapolated(
+    old: RigidTransform, new: RigidTransform, last: Float[np.ndarray, "6"] | None
+) -> tuple[RigidTransform, Float[np.ndarray, "6"] | None]:
+    """The pose farther along a step that repeats the `last` one, and the step if it is as it was.
+
+    Near the solution every step is about the same share q of the last: the rest of the way is then
+    the sum of a geometric series, step / (1 - q) (Aitken's extrapolation).
+    """
+    turn = new.rotation @ old.rotation.T
+    step = np.concatenate(
+        [Rotation.from_matrix(turn).as_rotvec(), new.translation - turn @ old.translation]
+    )
+    if last is None:
+        return new, step
+    lengths = np.linalg.norm(step), np.linalg.norm(last)
+    if step @ last < _PARALLEL * lengths[0] * lengths[1]:
+        return new, step
+    longer = step / max(1 / _LONGEST, 1 - lengths[0] / lengths[1])
+    turn = Rotation.from_rotvec(longer[:3]).as_matrix()
+    return RigidTransform(turn @ old.rotation, turn @ old.translation + longer[3:]), None
 
 
 def _change(old: RigidTransform, new: RigidTransform) -> float:

@@ -17,7 +17,7 @@ class RegisterConfig:
     )
     """A second search, with learned features, if the first leaves doubts; None: there is none."""
     refine: RefineConfig | None = RefineConfig(
-        iterations=10,
+        iterations=5,
         kernel_annealing=8.0,
         both_directions=True,
         k=16,

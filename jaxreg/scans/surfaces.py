@@ -321,11 +321,13 @@ def finished(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(problem.known.held(refined.uncertainty))
     )
-    reason = cause or _reason(problem, refined, judged, weak, float(likelihood[1:].sum()))
+    reason = ""
+    if not success:
+        reason = cause or _reason(problem, refined, judged, weak, float(likelihood[1:].sum()))
     return assembled(
         (source, problem.reference),
         in_unit(refined.transform, length),
-        Verdict(success, chance, "" if success else reason, judged),
+        Verdict(success, chance, reason, judged),
         Accuracy(covariance, weak, refined.converged),
         distance=problem.distance * length,
         overlap=_overlap(problem, refined.transform),

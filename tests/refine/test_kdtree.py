@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg.geometry import rigid
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.correspondences import closest_pairs
-from jaxreg.refine.kdtree import index_cloud, iterate, iterate_all, tree_pairs
+from jaxreg.refine.kdtree import _extrapolated, index_cloud, iterate, iterate_all, tree_pairs
 from jaxreg.refine.robust import Weighting
 from jaxreg.types import RigidTransform
 
@@ -21,6 +21,36 @@ def test_the_last_width_is_used_where_a_wider_one_stands_still():
         config = RefineConfig(iterations=iterations, kernel_annealing=widest, epsilon=0.01)
         _, taken, converged, _ = iterate(start, cloud, cloud, weighting, config=config)
         assert (taken, converged) == (steps, True)
+
+
+@pytest.mark.parametrize(("share", "arrives"), [(0.3, True), (0.7, True), (0.9, False)])
+def test_steps_that_shrink_by_one_share_are_followed_to_their_limit(share, arrives, seed):
+    rng = np.random.default_rng(seed)
+    axis, shift = rng.normal(size=(2, 3))
+    # Both parts have gone 1 - share^n of their way after n steps, about one axis and along it.
+    axis, along = axis / np.linalg.norm(axis), 0.02 * np.linalg.norm(shift)
+
+    def after(way):
+        return RigidTransform(Rotation.from_rotvec(0.1 * way * axis).as_matrix(), along * way * axis)
+
+    poses = [after(1 - share**n) for n in range(3)]
+    kept, last = _extrapolated(poses[0], poses[1], None)
+    np.testing.assert_array_equal(kept.rotation, poses[1].rotation)
+    farther, none = _extrapolated(poses[1], poses[2], last)
+    assert none is None  # the next step says nothing of the last
+    # At most four times the step, which is all of the way up to a share of 3/4.
+    limit = after(1) if arrives else after(1 - share + 4 * share * (1 - share))
+    np.testing.assert_allclose(farther.rotation, limit.rotation, atol=1e-9)
+    np.testing.assert_allclose(farther.translation, limit.translation, atol=1e-9)
+
+
+def test_a_step_to_another_side_is_taken_as_it_is():
+    there = RigidTransform(np.eye(3), np.array([1.0, 0, 0]))
+    turned = RigidTransform(np.eye(3), np.array([1.0, 0.5, 0]))
+    _, last = _extrapolated(RigidTransform(np.eye(3), np.zeros(3)), there, None)
+    pose, last = _extrapolated(there, turned, last)
+    np.testing.assert_array_equal(pose.translation, turned.translation)
+    np.testing.assert_allclose(last, [0, 0, 0, 0, 0.5, 0])
 
 
 @pytest.mark.parametrize("both_directions", [False, True])
