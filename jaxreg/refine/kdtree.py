@@ -117,7 +117,8 @@ def iterate(
     remaining widths are skipped; at the final width all are. Up to `more` further iterations are
     made where the pose still moves: far at a wide kernel, at all at the final one. There steps are
     extrapolated. Only every `step`-th point looks for a partner; large clouds first converge with
-    fewer. `motions` is a basis of the unknown motions (rotation vector, translation) in the frame; None: all of them.
+    fewer. `motions` is a basis of the unknown motions (rotation vector, translation) in the frame;
+    None: all of them.
     """
     widths = widenings(config.iterations, config.kernel_annealing, np.dtype("float32"))
     stride = -(-max(len(source.points), len(reference.points)) // _COARSE)

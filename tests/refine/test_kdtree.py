@@ -31,7 +31,9 @@ def test_steps_that_shrink_by_one_share_are_followed_to_their_limit(share, arriv
     axis, along = axis / np.linalg.norm(axis), 0.02 * np.linalg.norm(shift)
 
     def after(way):
-        return RigidTransform(Rotation.from_rotvec(0.1 * way * axis).as_matrix(), along * way * axis)
+        return RigidTransform(
+            Rotation.from_rotvec(0.1 * way * axis).as_matrix(), along * way * axis
+        )
 
     poses = [after(1 - share**n) for n in range(3)]
     kept, last = _extrapolated(poses[0], poses[1], None)
