@@ -46,6 +46,9 @@ class Align:
     """Of each scan, write one point per cube of this edge (unit of the scans; default: all points)."""
     ordered: bool = False
     """The scans are a sequence: neighbours overlap. Only these and closures of loops are looked for."""
+    times: OptionalPath = None
+    """The same by the times of the scans: a file with one number a scan (text or NPY, any unit), in the
+    order of the scans above. Scans before and after a long pause are no neighbours."""
     initial: OptionalPath = None
     """Start from these poses (the formats of --poses); scans without one are looked for."""
     joint: bool = True
@@ -79,7 +82,7 @@ class Align:
                 scans.append(checked_scan(path, self.nonfinite))
             alignment = register_many(
                 [scan.points for scan in scans],
-                order="sequence" if self.ordered else "unknown",
+                order=_order(self),
                 initial=initial,
                 nonfinite=self.nonfinite,
                 strays=self.strays,
@@ -101,6 +104,14 @@ class Align:
         return SUCCESS if alignment.success else NOT_TRUSTED
 
 
+def _order(command: Align) -> Literal["sequence", "unknown"] | list[float]:
+    from jaxreg import io
+
+    if command.times is not None:
+        return io.read_numbers(command.times, len(command.scans), what="scan").tolist()
+    return "sequence" if command.ordered else "unknown"
+
+
 def _check(command: Align) -> None:
     """Refuse what cannot be read or written before the work, not after it."""
     from jaxreg import io
@@ -110,6 +121,8 @@ def _check(command: Align) -> None:
     repeated = [path for k, path in enumerate(command.scans) if path in command.scans[:k]]
     if repeated:
         raise ValueError(f"{repeated[0]} is named twice: name each scan once.")
+    if command.ordered and command.times:
+        raise ValueError("give --ordered (the order of the files) or --times, not both.")
     if command.voxel is not None and not command.voxel > 0:
         raise ValueError(f"--voxel must be positive, got {command.voxel:g}.")
     if command.output:
@@ -118,7 +131,7 @@ def _check(command: Align) -> None:
         io.check_poses_output(command.poses)
     if command.plot:
         check_picture(command.plot)
-    taken = [*command.scans, *filter(None, [command.initial])]
+    taken = [*command.scans, *filter(None, [command.initial, command.times])]
     outputs = (command.output, command.poses, command.json, command.html, command.plot)
     for path in filter(None, outputs):
         io.check_place(path, taken)
@@ -193,6 +206,5 @@ def _print(command: Align, scans: list["Scan"], alignment: "Alignment", seconds:
         line("not placed", f"and {len(alignment.unplaced) - _LISTED} more: see --json")
     line("verdict", summary.verdict(alignment))
     if not alignment.success:
-        say(
-            f"{'hint':<16} look at it with --html PAGE.html; poses to start from help: --initial FILE"
-        )
+        look = "" if command.html else "look at it with --html PAGE.html; "
+        say(f"{'hint':<16} {look}poses to start from help: --initial FILE")

@@ -51,8 +51,8 @@ def read_arrays(
     return arrays
 
 
-def read_numbers(path: Path, count: int) -> np.ndarray:
-    """One number a point: text with one a line, or NPY.
+def read_numbers(path: Path, count: int, *, what: str = "point") -> np.ndarray:
+    """One number a point, or whatever `what` says: text with one a line, or NPY.
 
     Raises:
       ValueError: there is no such file, it holds no numbers, or not `count` of them.
@@ -63,11 +63,11 @@ def read_numbers(path: Path, count: int) -> np.ndarray:
         raise ValueError(f"{path}: no such file; check the path.") from None
     except Exception as error:  # noqa: BLE001 - numpy raises types of its own
         told = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} holds no numbers ({told}): write one for each point.") from None
+        raise ValueError(f"{path} holds no numbers ({told}): write one for each {what}.") from None
     numbers = np.asarray(loaded)
     if numbers.shape != (count,) or numbers.dtype.kind not in "bfiu":
         raise ValueError(
-            f"{path} is {numbers.dtype} {numbers.shape}: write {count:,} numbers, one for each point."
+            f"{path} is {numbers.dtype} {numbers.shape}: write {count:,} numbers, one for each {what}."
         )
     return numbers
 

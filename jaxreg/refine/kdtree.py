@@ -34,8 +34,9 @@ misses."""
 _PARALLEL, _LONGEST = 0.8, 4.0
 """A step is extrapolated where the cosine to the last one is at least the first, up to so many
 times its length."""
-_SMALLEST = 512
-"""Smallest padded size: below, one more compilation costs more than the padding."""
+_SIZES = 1024, 4096
+"""Padded sizes of small clouds, powers of two above. Programs are compiled for *pairs* of sizes: one
+more size costs more time than the padding."""
 
 
 class IndexedCloud(NamedTuple):
@@ -91,13 +92,17 @@ def index_cloud(
     found = min(k, len(points) - 1) + 1
     # One more than asked for: the point finds itself, and a row of its own index does not count.
     _, index = tree.query(points, k=list(range(1, found + 1)), workers=-1)
-    size = padded_size(len(points), smallest=_SMALLEST)
+    size = _padded_size(len(points))
     rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, k + 1)).copy()
     rows[: len(points), :found] = index
     fill = ((0, size - len(points)), (0, 0))
     padded = jax.device_put(np.pad(points, fill))
     given = None if normals is None else jax.device_put(np.pad(normals, fill))
     return IndexedCloud(points, tree, rows[:, 1:], padded, *_described(padded, rows, given))
+
+
+def _padded_size(count: int) -> int:
+    return padded_size(count, smallest=next((s for s in _SIZES if s >= count), _SIZES[-1]))
 
 
 def iterate(
@@ -211,13 +216,13 @@ def tree_pairs(
     Of poses with leading axes there are as many pairs. Those farther apart than `within` do not count.
     """
     forward = source.moved_by(pose, stride)
-    size = padded_size(forward.shape[-2], smallest=_SMALLEST)
+    size = -(-len(source.padded) // stride)
     distance, index = reference.nearest(forward, within=within)
     found, i, j = np.isfinite(distance), _rows(source, index, stride), index
     if both_directions:
         backward = reference.moved_back_by(pose, stride)
         # A sum of two sizes, so that only the sizes of the clouds decide which program runs.
-        size += padded_size(backward.shape[-2], smallest=_SMALLEST)
+        size += -(-len(reference.padded) // stride)
         distance, index = source.nearest(backward, within=within)
         found = np.concatenate([found, np.isfinite(distance)], axis=-1)
         i = np.concatenate([i, index], axis=-1)

@@ -36,7 +36,9 @@ def figures(alignment: Alignment) -> dict[str, str]:
         found["pairs"] += f", {len(sure)} refused although a success by themselves"
     for step in alignment.steps:
         gain = f"surfaces {step.before:.4g} apart before, {step.after:.4g} after"
-        found.setdefault("joint refinement", gain + ("" if step.kept else "; undone"))
+        found.setdefault(
+            "joint refinement", gain + ("" if step.kept else "; not kept, as it gained nothing")
+        )
     deviations = np.sqrt(np.maximum(np.einsum("kii->ki", alignment.covariance), 0))
     if np.isfinite(deviations).any():
         turn = math.degrees(np.nanmax(deviations[:, :3]))

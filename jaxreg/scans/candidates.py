@@ -29,7 +29,7 @@ _CLEAR, _HOPELESS = 1.0, 0.6
 """If the best score of the search is above the first, poses with less than this share of it are not
 looked at. On 66 pairs of four sensors the pose that the judge put first had the best score of the
 search wherever that was above 0.9."""
-_COUNTS = (1, 4, 16, 64)
+_COUNTS = (4, 16, 64)
 """Poses are judged in batches of these sizes, so that few programs are compiled."""
 
 

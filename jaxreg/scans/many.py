@@ -125,7 +125,7 @@ class Alignment:
 def register_many(
     clouds: Sequence[object],
     *,
-    order: Literal["unknown", "sequence"] = "unknown",
+    order: Literal["unknown", "sequence"] | Sequence[float] = "unknown",
     initial: Sequence[object] | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
@@ -141,7 +141,8 @@ def register_many(
 
     `clouds` are array-likes (n, 3) in one unit, or results of `jaxreg.prepare`, two at least. With
     `order` "sequence" neighbours in the list overlap, and only these and closures of loops are looked
-    for. `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
+    for; an `order` of numbers, one a scan, are the times at which the scans were taken (any unit):
+    neighbours are then those in time, unless ten times the usual step lies between them. `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
     frame. `joint` refines all poses together at the end. With `work`, a folder, prepared scans and
     finished pairs are kept there, and a run with the same scans and settings goes on where the last
     one ended. Pairs run on `executor` (any of `concurrent.futures`, Dask's, Ray's or mpi4py's; `work`
@@ -155,16 +156,15 @@ def register_many(
     config = RegisterConfig() if config is None else config
     names = _checked_names(clouds, names)
     starts = _checked_starts(initial, len(clouds))
-    if order not in ("unknown", "sequence"):
-        raise ValueError(f"order must be 'unknown' or 'sequence', got {order!r}.")
+    times = _checked_times(order, len(clouds))
     report = progress or (lambda done, wanted, text: None)
     prepared = []
     for k, cloud in enumerate(clouds):
         report(0, 0, f"preparing {names[k]}")
         prepared.append(_prepared(cloud, names[k], nonfinite, strays, config))
     with _runner(prepared, config, work, executor, workers) as runner:
-        run = _Run(prepared, runner, report, [])
-        _find_pairs(run, order, starts)
+        run = _Run(prepared, names, runner, report, [])
+        _find_pairs(run, times, starts)
         placement = placing.place(run.relations, run.sizes)
         steps: tuple[JointRefinement, ...] = ()
         if joint and placement.group.max(initial=-1) >= 0:
@@ -181,6 +181,22 @@ def _checked_names(clouds: Sequence[object], names: Sequence[str] | None) -> lis
     if len(names) != len(clouds):
         raise ValueError(f"{len(names)} names for {len(clouds)} scans: give one each.")
     return list(names)
+
+
+def _checked_times(order: object, count: int) -> Float[np.ndarray, "n"] | None:
+    """The times of the scans, their numbers for a sequence, None where nothing is known."""
+    if isinstance(order, str):
+        if order not in ("unknown", "sequence"):
+            raise ValueError(
+                f"order must be 'unknown', 'sequence' or the times of the scans, got {order!r}."
+            )
+        return np.arange(count, dtype=np.float64) if order == "sequence" else None
+    times = np.asarray(order)
+    if times.shape != (count,) or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        raise ValueError(
+            f"order is {times.dtype} {times.shape}: give one finite time for each of the {count} scans."
+        )
+    return times.astype(np.float64)
 
 
 def _checked_starts(initial: Sequence[object] | None, count: int) -> list[np.ndarray | None]:
@@ -217,6 +233,7 @@ class _Run(NamedTuple):
     """A registration of many scans while it goes on."""
 
     prepared: list[Prepared]
+    names: list[str]
     runner: _Runner
     report: Progress
     relations: list[Relation]
@@ -252,12 +269,12 @@ class _Run(NamedTuple):
         return {(r.reference, r.source): r.how for r in self.relations}
 
 
-def _find_pairs(run: _Run, order: str, starts: list[np.ndarray | None]) -> None:
+def _find_pairs(run: _Run, times: np.ndarray | None, starts: list[np.ndarray | None]) -> None:
     """Register pairs until every scan is held by several, or no promising pair is left."""
     likeness = proposals.likeness(run.prepared)
     if any(start is not None for start in starts):
         run.do(_from_starts(run, starts), "registering pairs from their start")
-    run.do(_first_pairs(run, likeness, order), "registering pairs")
+    run.do(_first_pairs(run, likeness, times), "registering pairs")
     for _ in range(2):
         placement = placing.place(run.relations, run.sizes)
         run.do(_nearby(run, placement), "registering neighbours")
@@ -277,11 +294,10 @@ def _tasks(pairs: set[tuple[int, int]], how: How) -> list[Task]:
     return [Task(source, reference, how) for reference, source in sorted(pairs)]
 
 
-def _first_pairs(run: _Run, likeness: np.ndarray, order: str) -> list[Task]:
+def _first_pairs(run: _Run, likeness: np.ndarray, times: np.ndarray | None) -> list[Task]:
     count = len(run.prepared)
-    if order == "sequence":
-        pairs = {(k, k + step) for step in (1, 2) for k in range(count - step)}
-        pairs |= proposals.most_alike(likeness, 2)
+    if times is not None:
+        pairs = proposals.successive(times) | proposals.most_alike(likeness, 2)
     elif count <= _ALL_PAIRS:
         pairs = {(i, j) for j in range(count) for i in range(j)}
     else:
@@ -456,7 +472,8 @@ def _alignment(placement: Placement, run: _Run, steps) -> Alignment:
         )
     )
     reasons = tuple(
-        "" if placement.group[k] >= 0 else _why_alone(k, pairs) for k in range(len(run.prepared))
+        "" if placement.group[k] >= 0 else _why_alone(k, pairs, run.names)
+        for k in range(len(run.prepared))
     )
     notes = tuple(note for cloud in run.prepared for note in cloud.notes)
     return Alignment(
@@ -465,11 +482,11 @@ def _alignment(placement: Placement, run: _Run, steps) -> Alignment:
     )  # fmt: skip
 
 
-def _why_alone(scan: int, pairs: tuple[Pair, ...]) -> str:
+def _why_alone(scan: int, pairs: tuple[Pair, ...], names: list[str]) -> str:
     """The reason of the most probable of its pairs."""
     own = [p for p in pairs if scan in (p.relation.source, p.relation.reference)]
     if not own:
         return "It was compared with no other scan."
     best = max(own, key=lambda p: p.relation.probability)
     other = best.relation.source + best.relation.reference - scan
-    return f"No pair of it is sure; the likeliest, with scan {other}: {best.reason}"
+    return f"No pair of it is sure; the likeliest, with {names[other]}: {best.reason}"

@@ -9,6 +9,8 @@ from jaxreg.scans.prepare import Prepared, in_steps
 _SIZE = 1024
 _SAMPLE = 256
 """Points whose descriptors are compared."""
+_PAUSE = 10.0
+"""Scans between which so many usual steps of time lie are no neighbours."""
 _SHOWN = 512
 """Points that tell how far two placed scans overlap."""
 
@@ -35,6 +37,21 @@ def most_alike(likeness: Float[np.ndarray, "n n"], most: int) -> set[tuple[int, 
     np.fill_diagonal(others, -np.inf)
     order = np.argsort(-others, axis=1, kind="stable")[:, : min(most, len(others) - 1)]
     return {(min(i, j), max(i, j)) for i, row in enumerate(order.tolist()) for j in row}
+
+
+def successive(times: Float[np.ndarray, "n"]) -> set[tuple[int, int]]:
+    """Of every scan the next one in time and the one after that, unless a pause lies between."""
+    order = np.argsort(times, kind="stable")
+    steps = np.diff(times[order])
+    part = np.concatenate([[0], np.cumsum(steps > _PAUSE * np.median(steps))])
+    return {
+        (min(i, j), max(i, j))
+        for step in (1, 2)
+        for i, j, same in zip(
+            order[:-step].tolist(), order[step:].tolist(), part[:-step] == part[step:], strict=True
+        )
+        if same
+    }
 
 
 def _features(prepared: list[Prepared]) -> list[np.ndarray]:

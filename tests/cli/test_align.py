@@ -68,6 +68,13 @@ def test_a_scan_of_something_else_is_said_and_left_out(scans, folder, run):
     assert list(io.read_poses(folder / "p.txt")) == scans[:2]
 
 
+def test_scans_may_have_times(scans, folder, run):
+    (folder / "times.txt").write_text("1305031102.5\n1305031101.5\n")
+    status, out, _ = run("align", *scans[:2], "--times", folder / "times.txt", "--no-joint")
+    assert status == SUCCESS
+    assert "1 registered, 1 used" in out
+
+
 def test_poses_of_an_earlier_run_are_a_start(aligned, scans, run):
     folder, _ = aligned
     status, out, _ = run("align", *scans[:2], "--initial", folder / "p.json", "--no-joint")
@@ -87,10 +94,14 @@ def test_poses_of_an_earlier_run_are_a_start(aligned, scans, run):
         (["a.ply", "b.pcd", "-o", "a.ply"], "already read or written"),
         (["a.ply", "b.pcd", "--initial", "none.json"], "no such file"),
         (["a.ply", "b.pcd", "--voxel", "-1"], "--voxel must be positive"),
+        (["a.ply", "b.pcd", "--times", "none.txt"], "no such file"),
+        (["a.ply", "b.pcd", "--times", "three.txt"], "write 2 numbers, one for each scan"),
+        (["a.ply", "b.pcd", "--times", "three.txt", "--ordered"], "not both"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, folder, run, monkeypatch):
     monkeypatch.chdir(folder)
+    (folder / "three.txt").write_text("0.5\n1.5\n2.5\n")
     status, _, error = run("align", *arguments)
     assert status == BAD_INPUT
     assert message in error

@@ -167,6 +167,8 @@ def test_a_prepared_scan_is_the_same_after_it_was_stored(scans, tmp_path, seed):
         ({"initial": [None]}, "1 initial poses for 5 scans"),
         ({"initial": [np.ones((4, 4)), *[None] * 4]}, r"initial\[0\]"),
         ({"order": "random"}, "order must be"),
+        ({"order": [0.0]}, "one finite time for each of the"),
+        ({"order": [*[0.0] * 4, np.nan]}, "one finite time for each of the"),
         ({"workers": -1}, "workers must be"),
     ],
 )

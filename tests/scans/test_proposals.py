@@ -31,6 +31,15 @@ def test_scans_of_one_thing_are_most_alike(clouds):
     assert proposals.most_alike(score, 1) == {(0, 1), (2, 3)}
 
 
+def test_successive_scans_are_those_in_time_and_none_across_a_pause():
+    # In time: 2, 0, 3, then a pause of 100 usual steps, then 1, 4.
+    times = np.array([11.0, 111.0, 10.0, 12.0, 112.0])
+    assert proposals.successive(times) == {(0, 2), (0, 3), (2, 3), (1, 4)}
+    evenly = proposals.successive(np.arange(4.0))
+    assert evenly == {(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)}
+    assert proposals.successive(np.zeros(3)) == {(0, 1), (1, 2), (0, 2)}
+
+
 def test_the_most_alike_are_those_of_a_full_sort(seed):
     rng = np.random.default_rng(seed)
     score = rng.normal(size=(7, 7))
