@@ -140,14 +140,15 @@ def register_many(
     """Place many scans in one frame, and say which could not be placed.
 
     `clouds` are array-likes (n, 3) in one unit, or results of `jaxreg.prepare`, two at least. With
-    `order` "sequence" neighbours in the list overlap, and only these and closures of loops are looked
-    for; an `order` of numbers, one a scan, are the times at which the scans were taken (any unit):
-    neighbours are then those in time, unless ten times the usual step lies between them. `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
+    `order` "sequence" neighbours in the list overlap, and only these and closures of loops are
+    looked for; an `order` of numbers, one a scan, are the times at which the scans were taken (any
+    unit): neighbours are then those in time, unless ten times the usual step lies between them.
+    `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
     frame. `joint` refines all poses together at the end. With `work`, a folder, prepared scans and
     finished pairs are kept there, and a run with the same scans and settings goes on where the last
-    one ended. Pairs run on `executor` (any of `concurrent.futures`, Dask's, Ray's or mpi4py's; `work`
-    must then be a folder that its workers see), on `workers` processes of this machine, or in turn;
-    the result has the same bits. `names` are how messages refer to the scans.
+    one ended. Pairs run on `executor` (any of `concurrent.futures`, Dask's, Ray's or mpi4py's;
+    `work` must then be a folder that its workers see), on `workers` processes of this machine, or
+    in turn; the result has the same bits. `names` are how messages refer to the scans.
 
     Raises:
       ValueError: fewer than two clouds, a cloud that `jaxreg.prepare` refuses, or an option that is
