@@ -4,7 +4,7 @@
 
 Twenty rooms of any size lie in a ring around a courtyard, as in a museum. A spinning scanner (rays cast
 by Open3D, 1 cm of noise) stands every metre or so of the 100 m, and ends where it began. The scans
-are turned by any rotation and shuffled. `ate` is the root mean square distance of the scanner from its
+are turned by any rotation and shuffled; it is known where in each scan the scanner stood. `ate` is the root mean square distance of the scanner from its
 true places, after the best rigid alignment, with and without the joint refinement at the end.
 """
 
@@ -205,7 +205,9 @@ def main(options: Options) -> None:
         work = options.work or folder
         for name, joint in {"graph": False, "joint": True}.items():
             begin, cpu = time.perf_counter(), time.process_time()
-            alignment = register_many(walked.clouds, joint=joint, work=work)
+            alignment = register_many(
+                walked.clouds, viewpoints=[np.zeros(3)] * len(walked.clouds), joint=joint, work=work
+            )
             spent = {
                 "seconds": time.perf_counter() - begin,
                 "cpu_seconds": time.process_time() - cpu,

@@ -10,7 +10,15 @@ import numpy as np
 import tyro
 
 from jaxreg.cli.options import NOT_TRUSTED, SUCCESS, line, say
-from jaxreg.cli.register import OptionalPath, Output, check_picture, checked_scan, patience
+from jaxreg.cli.register import (
+    OptionalPath,
+    Output,
+    Viewpoint,
+    check_picture,
+    checked_scan,
+    patience,
+    place_of,
+)
 from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
@@ -51,6 +59,9 @@ class Align:
     order of the scans above. Scans before and after a long pause are no neighbours."""
     initial: OptionalPath = None
     """Start from these poses (the formats of --poses); scans without one are looked for."""
+    viewpoint: Viewpoint = "unknown"
+    """Where the scanner of each scan stood, as in `jaxreg register`: worth much where places look
+    alike."""
     joint: bool = True
     """Refine all poses together at the end."""
     work: OptionalPath = None
@@ -84,6 +95,10 @@ class Align:
                 [scan.points for scan in scans],
                 order=_order(self),
                 initial=initial,
+                viewpoints=[
+                    place_of(scan, path, self.viewpoint)
+                    for scan, path in zip(scans, self.scans, strict=True)
+                ],
                 nonfinite=self.nonfinite,
                 strays=self.strays,
                 names=names,

@@ -22,7 +22,7 @@ class Info:
         from jaxreg import io
         from jaxreg.scans import diagnosis, prepare
 
-        points, notes = io.read_scan(self.file)
+        points, notes, _ = io.read_scan(self.file)
         broken = ~np.isfinite(points).all(axis=1)
         line("file", f"{self.file}")
         for note in notes:

@@ -39,6 +39,7 @@ OptionalPath = Annotated[Path | None, _path()]
 Output = Annotated[Path | None, _path(aliases=["-o"])]
 Known = tyro.conf.UseAppendAction[tuple[Literal["upright", "inside"], ...]]
 Stable = Annotated[str, tyro.conf.arg(metavar="FILE|BOX", help_behavior_hint="")]
+Viewpoint = Literal["unknown", "origin", "file"]
 Degrees = Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")]
 
 
@@ -79,6 +80,10 @@ class Register:
     stable: Stable = ""
     """Where the reference has not changed: a box x0,y0,x1,y1 or x0,y0,z0,x1,y1,z1 in its coordinates,
     or a file with a number for each of its points (0: it moved). Only these points take part."""
+    viewpoint: Viewpoint = "unknown"
+    """Where the scanner of each scan stood: at the origin of its coordinates, or where its file says
+    (PCD, PTX). A pose that puts points between a scanner and what it measured is then held to be
+    wrong."""
     refine: Literal["gicp", "icp", "point_to_plane", "none"] = "gicp"
     """How to refine the pose that the search found."""
     nonfinite: Literal["raise", "drop"] = "raise"
@@ -98,7 +103,7 @@ class Register:
         source, reference = (scan.points for scan in scans)
         begin = time.perf_counter()
         with patience():
-            result = _registered(self, source, reference, initial)
+            result = _registered(self, scans, initial)
         seconds = time.perf_counter() - begin
         lost: list[str] = []
         try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
@@ -117,10 +122,12 @@ class Register:
 
 
 def _registered(
-    command: Register, source: np.ndarray, reference: np.ndarray, initial: np.ndarray | None
+    command: Register, scans: list["Scan"], initial: np.ndarray | None
 ) -> "ScanRegistration":
     from jaxreg.scans.pair import register
 
+    source, reference = (scan.points for scan in scans)
+    paths = (command.source, command.reference)
     refinement = command.config.refine or RefineConfig()
     method = command.refine
     refinement = None if method == "none" else dataclasses.replace(refinement, method=method)
@@ -132,11 +139,28 @@ def _registered(
         known=command.known,
         up=command.up,
         scale=command.scale,
+        viewpoint=tuple(
+            place_of(scan, path, command.viewpoint) for scan, path in zip(scans, paths, strict=True)
+        ),
         mask=(None, _stable(command.stable, reference)) if command.stable else None,
         nonfinite=command.nonfinite,
         strays=command.strays,
         config=dataclasses.replace(command.config, refine=refinement),
     )
+
+
+def place_of(scan: "Scan", path: Path, told: Viewpoint) -> np.ndarray | None:
+    """Where the scanner stood, as --viewpoint says; an error if the file does not say it."""
+    if told == "unknown":
+        return None
+    if told == "origin":
+        return np.zeros(3)
+    if scan.viewpoint is None:
+        raise ValueError(
+            f"{path} does not say where the scanner stood (PCD does, and PTX of one station): leave "
+            "out --viewpoint file."
+        )
+    return scan.viewpoint
 
 
 def _stable(told: str, reference: np.ndarray) -> np.ndarray:

@@ -7,7 +7,11 @@ from jaxtyping import Float
 
 
 class Scan(NamedTuple):
-    """The points of a file, and what a reader of them should know ("a mesh of 12 faces ...")."""
+    """The points of a file, and what a reader of them should know ("a mesh of 12 faces ...").
+
+    `viewpoint` is where the scanner stood, in the coordinates of the points, if the file says so.
+    """
 
     points: Float[np.ndarray, "n 3"]
     notes: tuple[str, ...] = ()
+    viewpoint: Float[np.ndarray, "3"] | None = None

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxreg.io import lzf
 from jaxreg.io.contents import Scan
@@ -30,9 +31,19 @@ def read(path: Path) -> Scan:
     """The points (n, 3), float64. Raises what `jaxreg.io.read_cloud` raises."""
     file = _opened(path)
     if _encoding(file) == "ascii":
-        return Scan(_coordinates(path, file))
+        return Scan(_coordinates(path, file), viewpoint=_viewpoint(file))
     rows = _rows(path, file)
-    return Scan(np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64))
+    points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    return Scan(points, viewpoint=_viewpoint(file))
+
+
+def _viewpoint(file: _File) -> np.ndarray | None:
+    """The place in ``VIEWPOINT tx ty tz qw qx qy qz``; None where there is none, or no numbers."""
+    try:
+        place = np.array([float(word) for word in file.entries.get("VIEWPOINT", [])[:3]])
+    except ValueError:
+        return None
+    return place if len(place) == 3 and np.isfinite(place).all() else None
 
 
 def more(path: Path) -> tuple[str, ...]:
@@ -49,12 +60,13 @@ def write(path: Path, points: np.ndarray) -> None:
 
 
 def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
-    """Write a PCD file again with its points (and normals) moved and every other field kept.
+    """Write a PCD file again with points, normals and viewpoint moved and every other field kept.
 
     The fields keep their order, ascii stays ascii, all else becomes binary; x, y, z become double
     where single precision would round them by more than a millionth of their extent.
     """
     file = _opened(original)
+    file.entries.update(_moved_viewpoint(file, rotation, translation))
     if _encoding(file) == "ascii":
         moved = _coordinates(original, file) @ rotation.T + translation
         return _write_ascii(path, file, moved, rotation)
@@ -74,6 +86,24 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
         for name, column in zip(_NORMALS, normals.T, strict=True):
             rows[name] = column
     return _write(path, rows, file.entries)
+
+
+def _moved_viewpoint(
+    file: _File, rotation: np.ndarray, translation: np.ndarray
+) -> dict[str, list[str]]:
+    """The moved place and attitude of the scanner; nothing where the file holds no seven numbers."""
+    place = _viewpoint(file)
+    try:
+        w, *axis = (float(word) for word in file.entries["VIEWPOINT"][3:7])
+        attitude = Rotation.from_quat([*axis, w])
+    except (KeyError, ValueError):
+        return {}
+    if place is None:
+        return {}
+    # -0.0 and 0.0 are one number.
+    x, y, z, w = (Rotation.from_matrix(turn_of(rotation)) * attitude).as_quat(canonical=True) + 0.0
+    numbers = [*(rotation @ place + translation + 0.0).tolist(), w, x, y, z]
+    return {"VIEWPOINT": [f"{number:.9g}" for number in numbers]}
 
 
 def _kind(kind: np.dtype, points: np.ndarray) -> np.dtype:

@@ -30,7 +30,9 @@ def read(path: Path) -> Scan:
         matrices.append(matrix)
     if not stations:
         return Scan(np.empty((0, 3)))
-    return Scan(np.concatenate(stations), (*_told(matrices), *_rays(lost)))
+    # The scanner of a station is the origin of its rows.
+    place = _placed(np.zeros((1, 3)), matrices[0])[0] if len(matrices) == 1 else None
+    return Scan(np.concatenate(stations), (*_told(matrices), *_rays(lost)), place)
 
 
 def _told(matrices: list[np.ndarray]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from jaxreg.judge.surface import Examined
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
+from jaxreg.scans.free_space import Sides
 from jaxreg.types import RigidTransform
 
 TURN_COST = 0.2
@@ -42,15 +43,19 @@ class Judged(NamedTuple):
 
 
 class Clouds(NamedTuple):
-    """Two clouds in one frame: with trees, and as the judge sees them in their own units."""
+    """Two clouds in one frame: with trees, and in their own units as judge and free space see them."""
 
     source: IndexedCloud
     reference: IndexedCloud
     examined: tuple[Examined, Examined]
+    sides: Sides
 
     def judge(self, poses: RigidTransform) -> tuple[Evidence, Float[np.ndarray, "k"]]:
-        """The evidence for every pose (leading axis), and its log odds (`jaxreg.judge`)."""
-        count = len(poses.rotation)
+        """The evidence for every pose (leading axis), and its log odds (`jaxreg.judge`).
+
+        Free space is in the log odds, not in the evidence.
+        """
+        count, free = len(poses.rotation), self.sides.log_odds(poses)
         poses = _padded(poses)
         spacings = (
             float(cloud.spacing) * index.scale
@@ -66,7 +71,7 @@ class Clouds(NamedTuple):
         scales = self.source.scale, self.reference.scale
         evidence, score = _read(poses, *self.examined, scales, there, back)
         evidence = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:count], evidence)
-        return evidence, np.asarray(score, np.float64)[:count]
+        return evidence, np.asarray(score, np.float64)[:count] + free
 
 
 def read(

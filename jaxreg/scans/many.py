@@ -127,6 +127,7 @@ def register_many(
     *,
     order: Literal["unknown", "sequence"] | Sequence[float] = "unknown",
     initial: Sequence[object] | None = None,
+    viewpoints: Sequence[object] | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
     names: Sequence[str] | None = None,
@@ -144,11 +145,13 @@ def register_many(
     looked for; an `order` of numbers, one a scan, are the times at which the scans were taken (any
     unit): neighbours are then those in time, unless ten times the usual step lies between them.
     `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
-    frame. `joint` refines all poses together at the end. With `work`, a folder, prepared scans and
-    finished pairs are kept there, and a run with the same scans and settings goes on where the last
-    one ended. Pairs run on `executor` (any of `concurrent.futures`, Dask's, Ray's or mpi4py's;
-    `work` must then be a folder that its workers see), on `workers` processes of this machine, or
-    in turn; the result has the same bits. `names` are how messages refer to the scans.
+    frame. `viewpoints` say where the scanner of each scan stood (3,), in the coordinates of the
+    scan, None where unknown: see `jaxreg.prepare`. `joint` refines all poses together at the end.
+    With `work`, a folder, prepared scans and finished pairs are kept there, and a run with the same
+    scans and settings goes on where the last one ended. Pairs run on `executor` (any of
+    `concurrent.futures`, Dask's, Ray's or mpi4py's; `work` must then be a folder that its workers
+    see), on `workers` processes of this machine, or in turn; the result has the same bits. `names`
+    are how messages refer to the scans.
 
     Raises:
       ValueError: fewer than two clouds, a cloud that `jaxreg.prepare` refuses, or an option that is
@@ -158,11 +161,16 @@ def register_many(
     names = _checked_names(clouds, names)
     starts = _checked_starts(initial, len(clouds))
     times = _checked_times(order, len(clouds))
+    if viewpoints is not None and len(viewpoints) != len(clouds):
+        raise ValueError(
+            f"{len(viewpoints)} viewpoints for {len(clouds)} scans: give one each, or None."
+        )
     report = progress or (lambda done, wanted, text: None)
     prepared = []
     for k, cloud in enumerate(clouds):
         report(0, 0, f"preparing {names[k]}")
-        prepared.append(_prepared(cloud, names[k], nonfinite, strays, config))
+        place = None if viewpoints is None else viewpoints[k]
+        prepared.append(_prepared(cloud, names[k], place, nonfinite, strays, config))
     with _runner(prepared, config, work, executor, workers) as runner:
         run = _Run(prepared, names, runner, report, [])
         _find_pairs(run, times, starts)
@@ -215,15 +223,21 @@ def _checked_starts(initial: Sequence[object] | None, count: int) -> list[np.nda
     return starts
 
 
-def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfig) -> Prepared:
+def _prepared(
+    cloud: object, name: str, viewpoint, nonfinite, strays, config: RegisterConfig
+) -> Prepared:
     if isinstance(cloud, Prepared):
         if cloud.config != config:
             raise ValueError(
                 f"{name} was prepared with another configuration: give jaxreg.prepare and "
                 "jaxreg.register_many the same config."
             )
+        if viewpoint is not None:
+            raise ValueError(f"{name} is prepared: give its viewpoint to jaxreg.prepare.")
         return cloud
-    return prepare(cloud, nonfinite=nonfinite, strays=strays, config=config, name=name)
+    return prepare(
+        cloud, viewpoint=viewpoint, nonfinite=nonfinite, strays=strays, config=config, name=name
+    )
 
 
 _Runner = Callable[[list[Task]], Iterator[Relation]]

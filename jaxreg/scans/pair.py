@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
 from jaxreg.refine.config import check_options
-from jaxreg.scans import few, inside, masks, planar, prepare, similar, surfaces
+from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
@@ -26,6 +26,7 @@ def register(
     scale: bool = False,
     mask: object = None,
     weights: object = None,
+    viewpoint: object = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
@@ -48,9 +49,11 @@ def register(
 
     `mask` (n,) of booleans leaves out points of the source that are known to have moved; a pair of
     masks is of both clouds. `weights` (n,) say how much the points of the source count in the last
-    stage. `nonfinite` and `strays` say what to do with rows that are NaN or infinite, and with a few
-    points that lie ten times as far from the middle as all others. The same input gives the same
-    bits.
+    stage. `viewpoint` (3,) is where the scanner of each cloud stood, in the cloud's own
+    coordinates; a pair of them is of source and reference, None of an unknown one. Poses that put
+    points between a scanner and what it measured are then held to be wrong. `nonfinite` and
+    `strays` say what to do with rows that are NaN or infinite, and with a few points that lie ten
+    times as far from the middle as all others. The same input gives the same bits.
 
     Raises:
       ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the
@@ -62,8 +65,10 @@ def register(
     facts = known_of(known, up, max_rotation_deg)
     start = None if initial is None else facts.allowed(check_pose(initial, "initial"))
     first, second = (
-        _prepared(cloud, name, nonfinite, strays, config)
-        for cloud, name in ((source, "source"), (reference, "reference"))
+        _prepared(cloud, name, place, nonfinite, strays, config)
+        for cloud, name, place in zip(
+            (source, reference), ("source", "reference"), free_space.places(viewpoint), strict=True
+        )
     )
     _check_dimensions((source, reference), (first, second))
     if mask is None and weights is None:
@@ -171,9 +176,15 @@ def _check_options(config: RegisterConfig) -> None:
         check_options(config.refine)  # an error for any clouds, also where none is refined
 
 
-def _prepared(cloud: object, name: str, nonfinite, strays, config: RegisterConfig) -> Prepared:
+def _prepared(
+    cloud: object, name: str, viewpoint: object, nonfinite, strays, config: RegisterConfig
+) -> Prepared:
     if not isinstance(cloud, Prepared):
-        return prepare.prepare(cloud, nonfinite=nonfinite, strays=strays, config=config, name=name)
+        return prepare.prepare(
+            cloud, viewpoint=viewpoint, nonfinite=nonfinite, strays=strays, config=config, name=name
+        )
+    if viewpoint is not None:
+        raise ValueError(f"{name} is prepared: give its viewpoint to jaxreg.prepare.")
     if cloud.config != config:
         raise ValueError(
             f"{name} was prepared with another configuration than this registration's: give "

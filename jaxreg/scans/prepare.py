@@ -21,6 +21,7 @@ from jaxreg.geometry import frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
+from jaxreg.scans import free_space
 from jaxreg.scans import strays as stray_points
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
@@ -93,7 +94,8 @@ class Prepared:
     `radius` (root mean square), so order and repetition of the rows, offset and unit do not change
     a result. `kept` says which rows of the input are finite and no strays, and ``points[row]`` are
     the kept rows in their own order. `notes` are sentences on what was odd about the cloud. `fine`
-    and `coarse` have at most `config.refine_points` and `config.search_points` points.
+    and `coarse` have at most `config.refine_points` and `config.search_points` points. `viewpoint`
+    is where the scanner stood, in the unit and frame of `points`, None if unknown.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -106,12 +108,18 @@ class Prepared:
     fine: Level
     coarse: Level
     config: RegisterConfig
+    viewpoint: Float[np.ndarray, "3"] | None = None
     _thinned: dict[float, Level] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def tree(self) -> cKDTree:
         """Over all points; unbalanced, which is built in a third of the time and searched as fast."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @functools.cached_property
+    def view(self) -> free_space.View | None:
+        """What the scanner saw, if it is known where it stood."""
+        return None if self.viewpoint is None else free_space.view(self.points, self.viewpoint)
 
     def thinned(self, size: float) -> Level:
         """`coarse` averaged in cubes of edge `size` (unit of the input)."""
@@ -137,6 +145,7 @@ def prepare(
     cloud: object,
     *,
     normals: object = None,
+    viewpoint: object = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
     config: RegisterConfig | None = None,
@@ -145,14 +154,17 @@ def prepare(
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
     `cloud` is array-like (n, 3), or (n, 2) in the plane z = 0. `normals` (n, 3), of any length and
-    sign, replace the computed ones; give zeros where unknown. `strays` are a few points ten times as
+    sign, replace the computed ones; give zeros where unknown. `viewpoint` (3,) is where the scanner
+    stood: a pose that puts points between it and what it measured is then held to be wrong. Give it
+    only for a cloud that was seen from one place. `strays` are a few points ten times as
     far from the middle as all others (`Prepared.notes` tells of them): they are left out, take part,
     or are an error; centre and radius are those of the others in any case. `config` must be that of
     the registration, and `name` is how messages refer to the cloud.
 
     Raises:
       ValueError: the cloud is not a numeric (n, 3) array with at least three finite points (the
-        message names the row), the normals have another shape or are not finite, or there are strays
+        message names the row), the normals or the viewpoint have another shape or are not finite, or
+        there are strays
         and `strays` is "raise".
     """
     config = RegisterConfig() if config is None else config
@@ -166,12 +178,14 @@ def prepare(
     across = None if across is None else across[kept][first]
     centre, radius = frame.measure(points[~far[first]])
     points = (points - centre) / (radius or 1.0)
+    place = free_space.check_place(viewpoint, name)
+    place = None if place is None else (place - centre) / (radius or 1.0)
     k = 10 if config.refine is None else config.refine.k
     fine = reduce_to(points, config.refine_points)
     coarse = reduce_to(fine, config.search_points)
     fine, coarse = (_level(level, points, across, k) for level in (fine, coarse))
     return Prepared(
-        points, across, centre, radius or 1.0, kept, row, notes, fine, coarse, config
+        points, across, centre, radius or 1.0, kept, row, notes, fine, coarse, config, place
     )  # fmt: skip
 
 
@@ -183,7 +197,8 @@ def part(cloud: Prepared, rows: Bool[np.ndarray, "n"], config: RegisterConfig) -
     chosen = cloud.row[rows[cloud.kept]]
     points = cloud.points[chosen] * cloud.radius + cloud.centre
     across = None if cloud.normals is None else cloud.normals[chosen]
-    return prepare(points, normals=across, strays="keep", config=config)
+    place = None if cloud.viewpoint is None else cloud.viewpoint * cloud.radius + cloud.centre
+    return prepare(points, normals=across, viewpoint=place, strays="keep", config=config)
 
 
 def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]:

@@ -17,7 +17,13 @@ _ARRAYS = ("points", "centre", "kept", "row")
 def fingerprint(cloud: Prepared) -> str:
     """32 hexadecimal digits that stand for the points of a cloud and how it was prepared."""
     found = hashlib.sha256(settings_text(cloud.config).encode())
-    for array in (cloud.points, cloud.centre, np.float64(cloud.radius), cloud.normals):
+    for array in (
+        cloud.points,
+        cloud.centre,
+        np.float64(cloud.radius),
+        cloud.normals,
+        cloud.viewpoint,
+    ):
         found.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
     return found.hexdigest()[:32]
 
@@ -36,8 +42,9 @@ def save(cloud: Prepared, path: Path) -> None:
         arrays |= {name: level.points, f"{name}_k": np.int64(level.k)}
         if level.normals is not None:
             arrays[f"{name}_normals"] = level.normals
-    if cloud.normals is not None:
-        arrays["normals"] = cloud.normals
+    for name in ("normals", "viewpoint"):
+        if (array := getattr(cloud, name)) is not None:
+            arrays[name] = array
     with whole(path) as part, part.open("wb") as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -58,6 +65,7 @@ def load(path: str | Path, config: RegisterConfig) -> Prepared:
         return Prepared(
             arrays["points"], arrays.get("normals"), arrays["centre"], float(arrays["radius"]),
             arrays["kept"], arrays["row"], tuple(arrays["notes"].tolist()), fine, coarse, config,
+            arrays.get("viewpoint"),
         )  # fmt: skip
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(

@@ -17,8 +17,9 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import chances
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, dense, diagnosis, prepare, stable, verdict
+from jaxreg.scans import candidates, dense, diagnosis, free_space, prepare, stable, verdict
 from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.free_space import Sides
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import (
@@ -68,8 +69,17 @@ class Problem(NamedTuple):
         """Both fine levels in the frame."""
         sides = (self.source, self.reference)
         source, reference = (side.in_frame(side.fine, self.where) for side in sides)
-        return candidates.Clouds(
-            source, reference, (sides[0].fine.examined, sides[1].fine.examined)
+        examined = (sides[0].fine.examined, sides[1].fine.examined)
+        return candidates.Clouds(source, reference, examined, self.free_space())
+
+    def free_space(self) -> Sides:
+        """Both clouds as free space sees them."""
+        sides = (self.source, self.reference)
+        length = float(self.where.length)
+        return Sides(
+            (sides[0].view, sides[1].view),
+            (sides[0].coarse.points, sides[1].coarse.points),
+            (sides[0].radius / length, sides[1].radius / length),
         )
 
     @property
@@ -235,7 +245,7 @@ def refine_pose(problem: Problem, pose: RigidTransform) -> Refined:
         return unrefined(pose)
     given = config.refine.max_correspondence_distance
     distance = given / float(problem.where.length) if math.isfinite(given) else problem.reach()
-    source, reference, _ = problem.clouds()
+    source, reference, *_ = problem.clouds()
     return refine_indexed(
         source, reference, initial=pose, distance=distance, config=config.refine, more=_MORE,
         motions=problem.motions,
@@ -323,7 +333,9 @@ def finished(
     )
     reason = ""
     if not success:
-        reason = cause or _reason(problem, refined, judged, weak, float(likelihood[1:].sum()))
+        rivals = float(likelihood[1:].sum())
+        cause = cause or _contradiction(problem, refined.transform)
+        reason = cause or _reason(problem, refined, judged, weak, rivals)
     return assembled(
         (source, problem.reference),
         in_unit(refined.transform, length),
@@ -357,6 +369,16 @@ def _reason(
             *(f"{told[:1].upper()}{told[1:]}." for told in units),
         ]
     )
+
+
+def _contradiction(problem: Problem, pose: RigidTransform) -> str:
+    """A sentence if free space speaks against the pose."""
+    share = float(
+        problem.free_space().share_in_front(jax.tree.map(lambda leaf: leaf[None], pose))[0]
+    )
+    if share < free_space.CONTRADICTED:
+        return ""
+    return f"{share:.0%} of the points lie in front of what the other scanner measured there."
 
 
 def _overlap(problem: Problem, pose: RigidTransform) -> float:

@@ -162,12 +162,29 @@ RAYS = "1.5 2.25 -3 0.5\n0 0 0 0.5\n4 5.5 6 0.5\n"
 def test_ptx_lays_every_station_by_its_matrix_and_says_so(tmp_path):
     identity = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
     (tmp_path / "a.ptx").write_text(PTX + identity + RAYS + PTX + POSE + RAYS)
-    points, notes = io.read_scan(tmp_path / "a.ptx")
+    points, notes, place = io.read_scan(tmp_path / "a.ptx")
+    assert place is None  # there are two scanners
     seen = [[1.5, 2.25, -3], [4, 5.5, 6]]
     placed = [[10 - 2.25, 20 + 1.5, 27], [10 - 5.5, 24, 36]]
     np.testing.assert_allclose(points, [*seen, *placed])
     assert notes[0].startswith("2 stations")
     assert notes[1].startswith("2 rays without a return")
+
+
+def test_the_scanner_of_one_ptx_station_stood_where_its_matrix_lays_the_origin(tmp_path):
+    (tmp_path / "a.ptx").write_text(PTX + POSE + RAYS)
+    np.testing.assert_allclose(io.read_scan(tmp_path / "a.ptx").viewpoint, [10, 20, 30])
+
+
+@pytest.mark.parametrize("version", PCD)
+def test_the_viewpoint_of_a_pcd_is_read_where_there_is_one(tmp_path, version):
+    head = PCD[version].replace("VIEWPOINT 0 0 0", "VIEWPOINT 1.5 -2 3")
+    (tmp_path / "a.pcd").write_bytes((head + BODY).encode("latin-1"))
+    place = io.read_scan(tmp_path / "a.pcd").viewpoint
+    if "VIEWPOINT" in head:
+        np.testing.assert_array_equal(place, [1.5, -2, 3])
+    else:
+        assert place is None
 
 
 @pytest.mark.parametrize(
@@ -191,7 +208,7 @@ def test_e57_of_two_scans(tmp_path):
     file.write_scan_raw(columns)
     file.write_scan_raw(columns, translation=np.array([10.0, 20, 30]))
     file.close()
-    points, notes = io.read_scan(tmp_path / "a.e57")
+    points, notes, _ = io.read_scan(tmp_path / "a.e57")
     np.testing.assert_allclose(points, [*ROWS, *(np.array(ROWS) + [10, 20, 30])])
     assert notes == ("2 scans as one cloud, each laid where its own pose says",)
 

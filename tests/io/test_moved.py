@@ -54,7 +54,7 @@ def test_ply_meshes_are_sampled_and_clouds_are_not(tmp_path):
     box = trimesh.creation.box((1, 2, 3))
     for name, encoding in (("a.ply", "binary"), ("b.ply", "ascii")):
         box.export(tmp_path / name, encoding=encoding)
-        points, notes = io.read_scan(tmp_path / name)
+        points, notes, _ = io.read_scan(tmp_path / name)
         assert len(points) == 20_000
         np.testing.assert_allclose(np.abs(points / [0.5, 1, 1.5]).max(axis=1), 1, atol=1e-6)
         assert notes == ("a mesh of 12 triangles, sampled over its surface",)
@@ -67,7 +67,7 @@ def test_polygons_of_ply_are_cut_into_triangles(tmp_path):
     head += "property float z\nelement face 2\nproperty list uchar int vertex_index\nend_header\n"
     corners = "0 0 0\n2 0 0\n2 2 0\n0 2 0\n1 3 0\n"
     (tmp_path / "a.ply").write_text(head + corners + "4 0 1 2 3\n3 3 2 4\n")
-    points, notes = io.read_scan(tmp_path / "a.ply")
+    points, notes, _ = io.read_scan(tmp_path / "a.ply")
     assert "3 triangles" in notes[0]
     assert np.mean(points[:, 1] <= 2) == pytest.approx(4 / 5, abs=0.01)  # areas 4 and 1
 
@@ -99,7 +99,8 @@ def test_binary_pcd_keeps_its_fields_and_their_order(tmp_path):
         assert (
             b"FIELDS rgb x y z normal_x normal_y normal_z intensity\nSIZE 4 4 4 4 4 4 4 4" in head
         )
-        assert b"WIDTH 1\nHEIGHT 2\nVIEWPOINT 1 2 3 1 0 0 0" in head
+        # The scanner moves with its points: a quarter about z.
+        assert b"WIDTH 1\nHEIGHT 2\nVIEWPOINT 8 21 33 0.707106781 0 0 0.707106781" in head
         assert body == b"".join(struct.pack("<I7f", *row) for row in MOVED)
 
 
@@ -118,6 +119,7 @@ def test_ascii_pcd_keeps_its_words(tmp_path):
     moved(tmp_path / "b.pcd", tmp_path / "a.pcd")
     body = (tmp_path / "b.pcd").read_bytes().partition(b"DATA ascii\n")[2].decode()
     assert body == "3368652 8 21 33 0 1 0 7\n4.2e+06 5 24 36 -1 0 0 9\n"
+    np.testing.assert_array_equal(io.read_scan(tmp_path / "b.pcd").viewpoint, [8, 21, 33])
 
 
 TEXTS = {
