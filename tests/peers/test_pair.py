@@ -65,8 +65,10 @@ def test_padding_changes_nothing_and_an_empty_cloud_gives_the_identity(name, see
 ONE_STEP = {
     "idam": dataclasses.replace(SMALL["idam"], iterations=1),
     "rpmnet": dataclasses.replace(SMALL["rpmnet"], train_iterations=1),
+    "fmr": SMALL["fmr"],
 }
-"""A later step starts from a pose that is a constant of the derivative, and no difference says that."""
+"""A later step of the first two starts from a pose that is a constant of the derivative, and no
+difference says that."""
 
 
 def losses(params, statistics, pairs, *, name):
