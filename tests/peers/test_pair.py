@@ -113,6 +113,22 @@ def test_a_loss_has_the_gradient_that_differences_say(name, seed):
     np.testing.assert_allclose(along, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-6)
 
 
+def test_a_copy_in_one_place_is_constant_and_another_is_the_mean(seed):
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([np.zeros((1, 3)), rng.normal(size=(5, 3))])
+    cloud = PointCloud(jnp.asarray(points), jnp.ones(6, bool))
+    scores = softmax_rows(rng.normal(size=(4, 6)))
+    found = pair.soft_copy(jnp.asarray(scores), cloud)
+    np.testing.assert_allclose(found, scores @ points, atol=1e-14)
+    # All rows point to the origin, but for weights that are less than rounding.
+    nearly = np.eye(6)[np.zeros(4, int)] + 1e-30 * scores
+    gap, change = jax.jvp(
+        lambda s: jnp.ptp(pair.soft_copy(s, cloud), axis=0), (jnp.asarray(nearly),), (scores,)
+    )
+    np.testing.assert_array_equal(gap, 0)
+    np.testing.assert_array_equal(change, 0)
+
+
 def test_the_softmax_of_a_row_is_over_valid_columns(seed):
     scores = np.random.default_rng(seed).normal(size=(5, 7))
     valid = np.arange(7) < 4
