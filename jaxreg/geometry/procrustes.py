@@ -140,6 +140,10 @@ def geman_mcclure_weights(
     rounding = 16 * jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(reference))
     floor = jnp.maximum(jax.lax.stop_gradient(rounding), jnp.finfo(source.dtype).tiny ** 0.25)
     scale = 9 * median + floor**2
+    # In units of itself: the derivative of the quotient has the square of the scale below, which for
+    # points at the origin is no number any more.
+    unit = jax.lax.stop_gradient(scale)
+    scale, square = scale / unit, square / unit
     return (scale / (scale + square)) ** 2
 
 
