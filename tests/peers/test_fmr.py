@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -137,6 +138,28 @@ def test_a_small_motion_of_the_same_points_is_found_by_any_encoder(number):
     assert errors[-1] < 1e-6 * errors[0]
     np.testing.assert_allclose(found.transform.rotation, turn, atol=1e-3)
     np.testing.assert_allclose(found.transform.translation, shift, atol=1e-3)
+
+
+def test_iterations_are_those_of_lapack_and_the_matrix_exponential(seed):
+    rng = np.random.default_rng(seed)
+    variables, x = doubles(WIDE, seed), shape(16)
+    y = x @ Rotation.from_rotvec([0.3, -0.2, 0.25]).as_matrix().T + rng.normal(0, 0.02, x.shape)
+    centres = x.mean(axis=0), y.mean(axis=0)
+    jacobian = np.asarray(twist_jacobian(variables, whole(y - centres[1]), config=WIDE))
+    target, pose = encode(variables, whole(y - centres[1]), config=WIDE), np.eye(4)
+    for _ in range(2):
+        moved = (x - centres[0]) @ pose[:3, :3].T + pose[:3, 3]
+        error = encode(variables, whole(moved), config=WIDE) - target
+        *omega, v1, v2, v3 = np.linalg.lstsq(jacobian, np.asarray(error))[0]
+        algebra = np.zeros((4, 4))
+        algebra[:3, :3], algebra[:3, 3] = np.cross(np.eye(3), omega), (v1, v2, v3)
+        pose = scipy.linalg.expm(algebra) @ pose
+    found = align(
+        variables, whole(x), whole(y), config=dataclasses.replace(WIDE, iterations=2)
+    ).transform
+    np.testing.assert_allclose(found.rotation, pose[:3, :3], atol=1e-8)
+    shift = pose[:3, 3] + centres[1] - pose[:3, :3] @ centres[0]
+    np.testing.assert_allclose(found.translation, shift, atol=1e-8)
 
 
 def test_no_increment_is_longer_than_a_linearisation_holds(seed):
