@@ -72,6 +72,7 @@ from .exported import (
 from .config import (
     CEMNetConfig as CEMNetConfig,
     DCPConfig as DCPConfig,
+    FMRConfig as FMRConfig,
     IDAMConfig as IDAMConfig,
     RPMNetConfig as RPMNetConfig,
 )

@@ -153,6 +153,24 @@ class RPMNetConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class FMRConfig:
+    """FMR (Huang et al., 2020)."""
+
+    channels: tuple[int, ...] = (64, 64, 64, 128, 1024)
+    """Widths of the encoder's layers; the last is that of the feature."""
+    hidden: tuple[int, ...] = (1024, 512, 256)
+    """Widths of the decoder's layers before the last."""
+    decoded: int = 2048
+    """Points that the decoder makes."""
+    iterations: int = 10
+    """Gauss-Newton iterations."""
+    supervision: Literal["semi-supervised", "unsupervised"] = "semi-supervised"
+    """Whether its loss also sees the true pose."""
+    bn_momentum: float = 0.9
+    """Share of the old running statistics that BatchNorm keeps at a training step."""
+
+
+@dataclasses.dataclass(frozen=True)
 class LossConfig:
     """The four losses of Eq. 14-18, summed over points, averaged over pairs."""
 
@@ -284,17 +302,18 @@ class Config:
     differs."""
     data: DataConfig = DataConfig()
     train: TrainConfig = TrainConfig()
-    network: Literal["paper", "dcp", "cemnet", "idam", "rpmnet"] = "paper"
+    network: Literal["paper", "dcp", "cemnet", "idam", "rpmnet", "fmr"] = "paper"
     """The method: the paper's, set up by `model`, or another one, set up by the section of its name."""
     dcp: DCPConfig = DCPConfig()
     cemnet: CEMNetConfig = CEMNetConfig()
     idam: IDAMConfig = IDAMConfig()
     rpmnet: RPMNetConfig = RPMNetConfig()
+    fmr: FMRConfig = FMRConfig()
     weights: str = ""
     """Released weights that `jaxreg evaluate` uses when no checkpoint is given."""
 
 
-PEERS = ("dcp", "cemnet", "idam", "rpmnet")
+PEERS = ("dcp", "cemnet", "idam", "rpmnet", "fmr")
 """Networks other than the paper's; each has a section of its name."""
 
 
@@ -398,6 +417,7 @@ _LEAST = {
     "rpmnet": dict.fromkeys(
         ("neighbors", "width", "hidden", "k_normals", "iterations", "train_iterations"), 1
     ),
+    "fmr": dict.fromkeys(("channels", "hidden", "decoded", "iterations"), 1),
     "pairs": {"points": 1, "kept": 1},
     "data": dict.fromkeys(("train_shapes", "test_shapes", "train_draws", "test_draws"), 1),
     "train": {"steps": 1, "batch": 1, "validate_every": 1, "validation_pairs": 1},

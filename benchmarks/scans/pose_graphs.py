@@ -16,7 +16,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from benchmarks import record
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import CHI_SQUARED, PoseGraph
 from jaxreg.graph.sparse import solve_poses
 from jaxreg.graph.trees import tree_poses

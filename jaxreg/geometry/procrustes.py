@@ -26,9 +26,10 @@ def weighted_procrustes(
 
     `source[i]` corresponds to `reference[i]`. Weights need not be normalised; negative weights
     count as zero. R is a rotation (det +1) for every input, mirrored and degenerate ones included.
-    All weights zero give the identity; a single positive weight gives ``R = I, t = y - x``. If the
-    best rotation is not unique (a line, a point) R is one of the best, and the derivative is the
-    one of least norm. First and higher derivatives are finite everywhere.
+    All weights zero give the identity; a single positive weight, or a cloud in one place, gives
+    ``R = I`` and t between the centroids. If the best rotation is not unique (a line, a point) R is
+    one of the best, and the derivative is the one of least norm. First and higher derivatives are
+    finite everywhere.
 
     Raises:
       ValueError: the shapes are not ``(n, 3), (n, 3), (n,)``, or the dtypes not one of float32 and
@@ -50,7 +51,14 @@ def weighted_procrustes(
         reference - reference_centroid[None, :],
         precision=Precision.HIGHEST,
     )
-    rotation = special_procrustes(covariance)
+    # Of points in one place the centroid leaves rounding, and of that no rotation follows.
+    sizes = [
+        jnp.max(jnp.where(weights[:, None] > 0, jnp.abs(points), 0), initial=0)
+        for points in (source, reference)
+    ]
+    rounding = 16 * jnp.finfo(source.dtype).eps ** 2 * sizes[0] * sizes[1]
+    known = jnp.max(jnp.abs(covariance)) > jax.lax.stop_gradient(rounding)
+    rotation = special_procrustes(jnp.where(known, covariance, 0))
     rotated = jnp.matmul(rotation, source_centroid, precision=Precision.HIGHEST)
     return RigidTransform(rotation, reference_centroid - rotated)
 
@@ -132,6 +140,10 @@ def geman_mcclure_weights(
     rounding = 16 * jnp.finfo(source.dtype).eps * jnp.max(jnp.abs(reference))
     floor = jnp.maximum(jax.lax.stop_gradient(rounding), jnp.finfo(source.dtype).tiny ** 0.25)
     scale = 9 * median + floor**2
+    # In units of itself: the derivative of the quotient has the square of the scale below, which for
+    # points at the origin is no number any more.
+    unit = jax.lax.stop_gradient(scale)
+    scale, square = scale / unit, square / unit
     return (scale / (scale + square)) ** 2
 
 

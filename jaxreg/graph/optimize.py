@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg.geometry import se3
 from jaxreg.geometry.small_linear import inverse_definite
-from jaxreg.graph import se3
 from jaxreg.graph.pose_graph import (
     CHI_SQUARED,
     PoseGraph,

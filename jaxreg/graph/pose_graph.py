@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Bool, Float, Int
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.types import RigidTransform
 
 CHI_SQUARED = 16.8

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.types import RigidTransform
 

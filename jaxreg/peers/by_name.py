@@ -8,11 +8,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxreg.config import Config
 from jaxreg.network import model
 from jaxreg.network.model import Variables
-from jaxreg.peers import cemnet, dcp, idam, rpmnet
+from jaxreg.peers import cemnet, dcp, fmr, idam, rpmnet
 from jaxreg.types import PointCloud, RigidTransform
 
-_PEERS: dict[str, ModuleType] = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet}
-TRAINED = ("paper", "idam", "rpmnet")
+_PEERS: dict[str, ModuleType] = {
+    "dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet, "fmr": fmr,
+}  # fmt: skip
+TRAINED = ("paper", "idam", "rpmnet", "fmr")
 """The networks that `train` trains; of the others there are weights of their authors."""
 
 

@@ -129,7 +129,7 @@ def sampling_network(
         for cloud in (source, reference)
     ]
     scores = pair.row_softmax(-feature_distance(features[0], features[1]), reference.mask)
-    copy = jnp.matmul(scores, reference.points, precision=Precision.HIGHEST)
+    copy = pair.soft_copy(scores, reference)
     weights = jnp.asarray(source.mask & jnp.any(reference.mask), copy.dtype)
     transform = weighted_procrustes(source.points, copy, weights)
     # Features are not negative: zero leaves the maximum of the valid points as it is.

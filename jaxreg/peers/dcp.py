@@ -79,7 +79,7 @@ def soft_pointer(
     """Where the source's points point to in the reference: the mean of `cloud` by the softmax."""
     product = jnp.matmul(source, reference.T, precision=Precision.HIGHEST)
     scores = pair.row_softmax(product / jnp.sqrt(source.shape[1]).astype(product.dtype), cloud.mask)
-    return jnp.matmul(scores, cloud.points, precision=Precision.HIGHEST)
+    return pair.soft_copy(scores, cloud)
 
 
 def _network(config: DCPConfig) -> Any:

@@ -4,6 +4,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.config import Config
@@ -77,6 +78,20 @@ def absolute_edges(cloud: PointCloud, k: int) -> Float[Array, "n k 6"]:
     others = knn(cloud.points, k - 1, cloud.mask)
     near = cloud.points[jnp.concatenate([itself, others], axis=1)]
     return jnp.concatenate([near, jnp.broadcast_to(cloud.points[:, None], near.shape)], axis=-1)
+
+
+def soft_copy(scores: Float[Array, "n m"], cloud: PointCloud) -> Float[Array, "n 3"]:
+    """The mean of a cloud by every row of scores, which sum to 1.
+
+    Where all rows point to one place only rounding is left of their differences: then it is constant.
+    No pose follows from rounding, and the derivative of a pose by it is as large as it is small: 1e24
+    for a line with a point at the origin, in float32.
+    """
+    copy = jnp.matmul(scores, cloud.points, precision=Precision.HIGHEST)
+    middle = jnp.mean(copy, axis=0, keepdims=True)
+    rounding = 16 * jnp.finfo(copy.dtype).eps * jnp.max(jnp.abs(cloud.points))
+    one_place = jnp.max(jnp.abs(copy - middle)) <= jax.lax.stop_gradient(rounding)
+    return jnp.where(one_place, middle, copy)
 
 
 def row_softmax(scores: Float[Array, "n m"], valid: Bool[Array, "m"]) -> Float[Array, "n m"]:

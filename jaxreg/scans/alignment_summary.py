@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.io.poses import Edges
 from jaxreg.scans.many import Alignment
 from jaxreg.scans.relation import Relation

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.judge.odds import chances as chances_of
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import triples

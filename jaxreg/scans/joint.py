@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import EdgeEquations, PoseGraph, retract
 from jaxreg.graph.sparse import gauss_newton_steps
 from jaxreg.refine.kdtree import IndexedCloud

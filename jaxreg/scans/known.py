@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.refine.uncertainty import PoseUncertainty
 from jaxreg.types import RigidTransform
 

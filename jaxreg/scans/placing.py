@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import CHI_SQUARED, PoseGraph, squared_errors
 from jaxreg.graph.sparse import pose_covariances, solve_poses
 from jaxreg.graph.trees import components, spanning_tree, tree_poses, triangle_errors, triangles

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.scans import planes
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known

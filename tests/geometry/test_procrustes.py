@@ -190,6 +190,29 @@ def test_weights_that_vanish(rng):
     np.testing.assert_allclose(translation, reference[2] - source[2], atol=1e-14)
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_cloud_in_one_place_does_not_turn_by_its_rounding(rng, dtype):
+    """Its centroid differs from it in the last digit, and so would a covariance, for every place."""
+    program = jax.jit(
+        lambda x, y, w: (
+            weighted_procrustes(x, y, w),
+            jax.jacrev(lambda y: weighted_procrustes(x, y, w).rotation)(y),
+        )
+    )
+    source, weights = rng.normal(size=(23, 3)).astype(dtype), rng.uniform(0.1, 1, 23).astype(dtype)
+    for size in (1e-20, 1.0, 1e6):
+        place = np.tile((size * rng.normal(size=3)).astype(dtype), (23, 1))
+        for x, y in ((source, place), (place, source)):
+            transform, derivative = program(x, y, weights)
+            np.testing.assert_array_equal(transform.rotation, np.eye(3))
+            np.testing.assert_array_equal(derivative, 0)
+    # What is small beside its offset, but more than rounding, does turn.
+    far = source + np.asarray(1e3, dtype)
+    turn = Rotation.from_euler("z", 90, degrees=True).as_matrix().astype(dtype)
+    found = program(far, far @ turn.T, weights)[0].rotation
+    np.testing.assert_allclose(found, turn, atol=1e-3 if dtype == "float32" else 1e-9)
+
+
 def test_negative_weights_count_as_zero(rng):
     source, reference, weights = noisy_problem(rng)
     signed = np.where(np.arange(20) % 3, weights, -weights)

@@ -56,6 +56,50 @@ def definite(seed):
     return rows.T @ rows
 
 
+@pytest.mark.parametrize("rank", [0, 3, 6])
+def test_pseudo_inverse_is_that_of_lapack_and_so_is_its_derivative(seed, rank):
+    """Along a path of constant rank the derivative is that of central differences."""
+    rng = np.random.default_rng(seed)
+    rows, direction = rng.normal(size=(2, rank, 6))
+
+    def matrix(step):
+        moved = rows + step * direction
+        return jnp.matmul(moved.T, moved)
+
+    def exact(step):
+        return np.linalg.pinv(matrix(step), rcond=1e-9, hermitian=True)
+
+    found, tangent = jax.jvp(
+        jax.jit(lambda step: small_linear.pseudo_inverse(matrix(step))), (0.0,), (1.0,)
+    )
+    scale = np.abs(exact(0.0)).max()
+    np.testing.assert_allclose(found, exact(0.0), atol=1e-10 * scale)
+    difference = (exact(1e-6) - exact(-1e-6)) / 2e-6
+    np.testing.assert_allclose(tangent, difference, atol=1e-5 * np.abs(difference).max())
+
+
+def test_pseudo_inverse_of_an_ill_conditioned_matrix_has_the_derivative_of_the_inverse(seed):
+    """Where the condition is 1e9, ``I - A P`` is rounding that P, twice, would make as large."""
+    rng = np.random.default_rng(seed)
+    basis, change = np.linalg.qr(rng.normal(size=(6, 6)))[0], rng.normal(size=(6, 6))
+    matrix, change = basis * 10.0 ** (-1.8 * np.arange(6)) @ basis.T, change + change.T
+    found, tangent = jax.jit(lambda x, y: jax.jvp(small_linear.pseudo_inverse, (x,), (y,)))(
+        matrix, change
+    )
+    inverse = np.linalg.inv(matrix)
+    expected = -inverse @ change @ inverse
+    np.testing.assert_allclose(found, inverse, atol=1e-6 * np.abs(inverse).max())
+    np.testing.assert_allclose(tangent, expected, atol=1e-5 * np.abs(expected).max())
+    definite_one = jnp.asarray(definite(seed))
+    check_grads(
+        jax.jit(small_linear.pseudo_inverse),
+        (definite_one,),
+        order=2,
+        modes=("fwd", "rev"),
+        rtol=1e-5,
+    )
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_inverse_is_that_of_lapack(seed, dtype):
     matrix = definite(seed)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.optimize import optimize_poses
 from jaxreg.graph.pose_graph import truncated_weights
 from jaxreg.graph.sparse import solve_poses

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import PoseGraph, squared_errors
 from jaxreg.graph.sparse import pose_covariances, solve_poses
 from jaxreg.io.poses import read_g2o

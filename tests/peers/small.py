@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from jaxreg.config import CEMNetConfig, DCPConfig, IDAMConfig, RPMNetConfig
-from jaxreg.peers import cemnet, dcp, idam, rpmnet
+from jaxreg.config import CEMNetConfig, DCPConfig, FMRConfig, IDAMConfig, RPMNetConfig
+from jaxreg.peers import cemnet, dcp, fmr, idam, rpmnet
 
 K = 3
 SMALL = {
@@ -18,8 +18,9 @@ SMALL = {
         radius=2.0, neighbors=4, width=4, hidden=(4, 8, 4, 4), k_normals=K, sinkhorn=2,
         iterations=2, train_iterations=2,
     ),
+    "fmr": FMRConfig(channels=(8, 24), hidden=(6,), decoded=5, iterations=2),
 }  # fmt: skip
-MODULES = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet}
+MODULES = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet, "fmr": fmr}
 
 
 def draw_variables(module, config, rng):

@@ -70,6 +70,21 @@ def test_the_released_weights_fill_the_network_and_embed_as_they_should(peers_ro
     np.testing.assert_allclose(embed(cloud), expected, atol=1e-8)
 
 
+@pytest.mark.peers
+@pytest.mark.parametrize("extent", [0.05, 0.32394126, 0.36987798, 0.42232879, 3.0])
+def test_the_gradient_at_a_line_through_the_origin_is_no_rounding(peers_root, extent):
+    """The released weights let all points point to one: 1e24 and NaN came of what softmax left."""
+    variables, config = dcp.load_weights(peers_root / "dcp_v1.npz")
+    line = jnp.asarray(extent * np.outer(np.arange(24), [1, 2, 3]), jnp.float32)
+
+    def of_pose(source, reference):
+        found = dcp.register(variables, source, reference, config=config.dcp)
+        return jnp.sum(found.rotation[0]) + jnp.sum(found.translation)
+
+    for gradient in jax.jit(jax.grad(of_pose, argnums=(0, 1)))(line, line):
+        assert np.abs(gradient).max() < 1e3
+
+
 def test_what_is_no_weight_file_is_named(tmp_path):
     np.savez(tmp_path / "other.npz", weight=np.zeros(3))
     with pytest.raises(ValueError, match=r"missing\.npz: no such file"):

@@ -65,8 +65,10 @@ def test_padding_changes_nothing_and_an_empty_cloud_gives_the_identity(name, see
 ONE_STEP = {
     "idam": dataclasses.replace(SMALL["idam"], iterations=1),
     "rpmnet": dataclasses.replace(SMALL["rpmnet"], train_iterations=1),
+    "fmr": SMALL["fmr"],
 }
-"""A later step starts from a pose that is a constant of the derivative, and no difference says that."""
+"""A later step of the first two starts from a pose that is a constant of the derivative, and no
+difference says that."""
 
 
 def losses(params, statistics, pairs, *, name):
@@ -109,6 +111,22 @@ def test_a_loss_has_the_gradient_that_differences_say(name, seed):
         for s in (step, -step)
     )
     np.testing.assert_allclose(along, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-6)
+
+
+def test_a_copy_in_one_place_is_constant_and_another_is_the_mean(seed):
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([np.zeros((1, 3)), rng.normal(size=(5, 3))])
+    cloud = PointCloud(jnp.asarray(points), jnp.ones(6, bool))
+    scores = softmax_rows(rng.normal(size=(4, 6)))
+    found = pair.soft_copy(jnp.asarray(scores), cloud)
+    np.testing.assert_allclose(found, scores @ points, atol=1e-14)
+    # All rows point to the origin, but for weights that are less than rounding.
+    nearly = np.eye(6)[np.zeros(4, int)] + 1e-30 * scores
+    gap, change = jax.jvp(
+        lambda s: jnp.ptp(pair.soft_copy(s, cloud), axis=0), (jnp.asarray(nearly),), (scores,)
+    )
+    np.testing.assert_array_equal(gap, 0)
+    np.testing.assert_array_equal(change, 0)
 
 
 def test_the_softmax_of_a_row_is_over_valid_columns(seed):

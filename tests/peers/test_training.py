@@ -40,6 +40,6 @@ def test_two_steps_a_checkpoint_and_a_method(name, tmp_path):
 
 def test_a_network_that_is_not_trained_here_says_so(tmp_path):
     with pytest.raises(
-        ValueError, match="'dcp' is not trained here: .* one of paper, idam, rpmnet"
+        ValueError, match="'dcp' is not trained here: .* one of paper, idam, rpmnet, fmr"
     ):
         train(Config(network="dcp"), tmp_path)

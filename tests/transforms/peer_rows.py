@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxreg.peers import cemnet, dcp, idam, rpmnet
+from jaxreg.peers import cemnet, dcp, fmr, idam, rpmnet
 from jaxreg.types import PointCloud
 from tests.peers.small import MODULES, SMALL, draw_variables
 from tests.transforms.rows import K, N, Row, every, everything, neighbor_graph, points, pose
@@ -129,5 +129,56 @@ def peer_rows() -> dict[str, Row]:
             lambda a: rpmnet.sinkhorn(a, jnp.ones(a.shape, bool), rounds=3),
             (affinity,),
             ((np.zeros((N, N)),), (1e3 * affinity,)),
+        ),
+        **fmr_rows(variables["fmr"], source, moved),
+    }
+
+
+def fmr_rows(variables, source, moved) -> dict[str, Row]:
+    config = SMALL["fmr"]
+    jacobian = RNG.normal(size=(24, 6))
+    align = lambda v, x, y: fmr.align_features(v, cloud(x), cloud(y), config=config)  # noqa: E731
+    return {
+        "peers.fmr.encode": Row(
+            lambda v, x: fmr.encode(v, cloud(x), config=config),
+            (variables, source),
+            every(lambda x: (variables, x)),
+            loose=True,
+            kinks=True,
+        ),
+        "peers.fmr.decode": Row(
+            lambda v, feature: fmr.decode(v, feature, config=config),
+            (variables, RNG.normal(size=24)),
+            ((variables, np.zeros(24)),),
+            loose=True,
+        ),
+        "peers.fmr.align_features": Row(
+            align,
+            (variables, source, moved),
+            every(lambda x: (variables, x, x)),
+            loose=True,
+            kinks=True,
+        ),
+        "peers.fmr.twist_jacobian": Row(
+            lambda v, x: fmr.twist_jacobian(v, cloud(x), config=config),
+            (variables, source),
+            every(lambda x: (variables, x)),
+            loose=True,
+            kinks=True,
+        ),
+        "peers.fmr.left_inverse": Row(
+            fmr.left_inverse,
+            (jacobian,),
+            ((np.zeros((24, 6)),), (jacobian * [1, 1, 1, 1, 1, 0],)),
+        ),
+        "peers.fmr.centroid": Row(
+            lambda x: fmr.centroid(cloud(x)), (source,), every(lambda x: (x,))
+        ),
+        "peers.fmr.centred": Row(lambda x: fmr.centred(cloud(x)), (source,), every(lambda x: (x,))),
+        "peers.fmr.chamfer_distance": Row(
+            lambda x, y: fmr.chamfer_distance(cloud(x), cloud(y)),
+            (source, moved[:-2]),
+            every(lambda x: (x, x)),
+            kinks=True,
         ),
     }

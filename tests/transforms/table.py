@@ -23,6 +23,7 @@ WHOLE = (
     "network.model.iterate",
     "peers.cemnet.register",
     "peers.dcp.register",
+    "peers.fmr.register",
     "peers.idam.register",
     "peers.rpmnet.register",
     "refine.methods.refine",

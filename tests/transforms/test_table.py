@@ -34,6 +34,7 @@ HOST |= {"network.batch.register_batch", "exported.export_program", "exported.lo
 """No transform applies to what reads files, numpy arrays on the host, shapes alone or a random key."""
 ELSEWHERE = {"batching.map_pairs", "data.pairs.make_pair", "training.batch_loss"}
 ELSEWHERE |= {"graph.optimize.optimize_poses", "peers.idam.loss", "peers.rpmnet.loss"}
+ELSEWHERE |= {"peers.fmr.loss"}
 """Transformed in their own tests: graph/test_optimize.py, test_batching.py, data/test_pairs.py,
 test_training.py and peers/."""
 OF_JAXLIE = {"geometry.rigid.to_jaxlie", "geometry.rigid.from_jaxlie"}
@@ -57,6 +58,7 @@ ROOMS = (
     "peers.cemnet",
     "peers.idam",
     "peers.rpmnet",
+    "peers.fmr",
     "geometry.frame",
     "refine.config",
     "refine.cost",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxreg.graph import se3
+from jaxreg.geometry import se3
 from jaxreg.types import RigidTransform
 
 ANGLES = (0.0, 1e-6, 3e-3, 0.0099, 0.0101, 0.3, 0.33, 1.0, 2.5, 3.14)
