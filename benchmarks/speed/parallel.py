@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import tyro
 
@@ -96,8 +97,22 @@ def steps(log: Path) -> int:
     return log.read_bytes().count(b"\n") if log.exists() else 0
 
 
-def rates(logs: list[Path], running: list, seconds: float, *, after: int = 5) -> list[float]:
-    """Steps a second of every run, over the same time, from its first to its last step in it."""
+def processor_seconds(running: list) -> float:
+    """What the processes have used, all threads."""
+    stats = [Path(f"/proc/{process.pid}/stat").read_text() for process in running]
+    ticks = sum(int(x) for stat in stats for x in stat.rpartition(")")[2].split()[11:13])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+class Rate(NamedTuple):
+    """Steps a second of all runs together, and processor seconds of all processes a step."""
+
+    steps: float
+    processor: float
+
+
+def rate(logs: list[Path], running: list, seconds: float, *, after: int = 5) -> Rate:
+    """Of runs over the same time, each from its first to its last step in it."""
     begin = time.monotonic()
     while any(steps(log) < after for log in logs):
         failed = [process for process in running if process.poll() is not None]
@@ -105,7 +120,8 @@ def rates(logs: list[Path], running: list, seconds: float, *, after: int = 5) ->
             raise RuntimeError(failed[0].stderr.read().decode() if failed else "no step in time")
         time.sleep(0.1)
     seen = [[] for _ in logs]
-    counts = [steps(log) for log in logs]
+    begun = counts = [steps(log) for log in logs]
+    used, counts = processor_seconds(running), list(counts)
     end = time.monotonic() + seconds
     while (now := time.monotonic()) < end:
         for number, log in enumerate(logs):
@@ -113,12 +129,16 @@ def rates(logs: list[Path], running: list, seconds: float, *, after: int = 5) ->
                 seen[number].append((now, count))
                 counts[number] = count
         time.sleep(0.01)
+    used = processor_seconds(running) - used
     spans = [(times[0], times[-1]) for times in seen]
-    return [(last[1] - first[1]) / (last[0] - first[0]) for first, last in spans]
+    return Rate(
+        sum((last[1] - first[1]) / (last[0] - first[0]) for first, last in spans),
+        used / (sum(counts) - sum(begun)),
+    )
 
 
-def pairs_a_second(kind: str, options: Options, cache: str) -> float:
-    """Of both cores together: `apart`, two runs, or `together`, one run of two processes."""
+def turn(kind: str, options: Options, cache: str) -> dict[str, float]:
+    """Pairs a second of both cores: `apart`, two runs, or `together`, one run of two processes."""
     count = len(options.cores)
     with tempfile.TemporaryDirectory() as folder:
         workdirs = [Path(folder) / (str(i) if kind == "apart" else "0") for i in range(count)]
@@ -131,7 +151,8 @@ def pairs_a_second(kind: str, options: Options, cache: str) -> float:
             ]
         logs = [path / "metrics.jsonl" for path in dict.fromkeys(workdirs)]
         with started(commands, options, cache) as running:
-            return batch * sum(rates(logs, running, options.seconds))
+            found = rate(logs, running, options.seconds)
+    return {"pairs": batch * found.steps, "processor_ms": 1e3 * found.processor / batch}
 
 
 def sent(options: Options, cache: str) -> dict[str, float]:
@@ -150,31 +171,45 @@ def sent(options: Options, cache: str) -> dict[str, float]:
         return found[0].result()
 
 
-def write(taken: dict[str, list[float]], told: dict[str, float], options: Options) -> Path:
+def write(
+    taken: dict[str, list[dict[str, float]]], told: dict[str, float], options: Options
+) -> Path:
     """The record `parallel`: a row each, the ratio of turns, and what is sent."""
     labels = {"apart": "two runs of one process", "together": "one run of two processes"}
+    pairs = {kind: [turn["pairs"] for turn in turns] for kind, turns in taken.items()}
+    work = {
+        kind: statistics.median(turn["processor_ms"] for turn in turns)
+        for kind, turns in taken.items()
+    }
     rows = {
         kind: {
             "label": labels[kind],
             "median": statistics.median(values),
             "best": max(values),
             "least": min(values),
+            "processor": work[kind],
         }
-        for kind, values in taken.items()
+        for kind, values in pairs.items()
     }
-    ratios = [b / a for a, b in zip(taken["apart"], taken["together"], strict=True)]
+    ratios = [b / a for a, b in zip(pairs["apart"], pairs["together"], strict=True)]
     setting = {
-        "ratio": round(statistics.median(ratios), 3),
-        "least_ratio": round(min(ratios), 3),
+        "ratio": round(statistics.median(ratios), 2),
+        "least_ratio": round(min(ratios), 2),
+        "processor_ratio": round(work["apart"] / work["together"], 2),
         "rounds": options.rounds,
         "batch": options.batch,
-        "step_ms": round(1e3 * 2 * options.batch / statistics.median(taken["together"])),
+        "load": round(os.getloadavg()[2], 1),
     } | {key: value for key, value in told.items() if key != "process_s"}
     return record.write(
         "parallel",
         question="What does training in many processes cost?",
         command=record.command("benchmarks.speed.parallel"),
-        columns={"median": "pairs/s, median", "best": "best turn", "least": "worst turn"},
+        columns={
+            "median": "pairs/s, median",
+            "best": "best turn",
+            "least": "worst turn",
+            "processor": "processor ms a pair",
+        },
         rows=rows,
         setting=setting,
     )
@@ -187,8 +222,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as cache:
         for number in range(options.rounds):
             for kind, values in taken.items():
-                values.append(pairs_a_second(kind, options, cache))
-                print(f"turn {number + 1}, {kind}: {values[-1]:.2f} pairs a second", flush=True)
+                values.append(turn(kind, options, cache))
+                print(f"turn {number + 1}, {kind}:", values[-1], flush=True)
         told = sent(options, cache)
     print(told)
     if options.record:
