@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-_lock = threading.Lock()
+_lock = threading.RLock()  # a program that is traced may call another
 _folder: Path | None = None
 _programs: dict[Any, Callable[..., Any]] = {}
 
@@ -43,9 +43,10 @@ def call(function: Callable[..., Any], told: tuple, arguments: tuple, static: di
     `told` is what the function closes over; one that closes over something and tells nothing is not
     kept.
     """
+    if _folder is None or (_closes_over(function) and not told):
+        return function(*arguments, **static)
     leaves, tree = jax.tree.flatten(arguments)
-    inside = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
-    if _folder is None or inside or (_closes_over(function) and not told):
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         return function(*arguments, **static)
     call = _Call(function, told, tuple(sorted(static.items())), tree, tuple(map(_form, leaves)))
     with _lock:

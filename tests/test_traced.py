@@ -129,3 +129,12 @@ def test_the_version_follows_the_files_and_the_settings(monkeypatch):
         assert _traced._version() != before
     monkeypatch.setattr(jax, "__version__", "0")
     assert _traced._version() != before
+
+
+def test_a_program_may_call_another_while_it_is_traced(tmp_path, another_process):
+    inner = Counted().jitted()
+    outer = from_host(
+        jax.jit(lambda x: x * inner(PAIR, np.float32(2), power=2)["sum"].first), told=("outer",)
+    )
+    with _traced.kept_in(tmp_path):
+        np.testing.assert_allclose(outer(np.float32(3)), 3 * expected()[0])
