@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Shaped
 
+from jaxreg import _traced
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -90,17 +92,18 @@ def varying_like(x: Shaped[Array, "..."], like: Shaped[Array, "..."]) -> Shaped[
     return jnp.where(jax.lax.stop_gradient(like) == 0, x, x)
 
 
-def from_host(function: _Function) -> _Function:
+def from_host(function: _Function, *, told: tuple[Any, ...] = ()) -> _Function:
     """`function`, a jitted one, for arrays of the host: it is meant to take them from there.
 
     So `jax.transfer_guard("disallow")`, with which programs look for transfers that nobody meant, does
-    not stop it. (To `jax.device_put` every argument takes longer than most of these functions.)
+    not stop it. (To `jax.device_put` every argument takes longer than most of these functions.) Its
+    program may be kept for the next process; `told` are the values that it closes over.
     """
 
     @functools.wraps(function)
     def call(*arguments, **static):
         with jax.transfer_guard_host_to_device("allow"):
-            return function(*arguments, **static)
+            return _traced.call(function, told, arguments, static)
 
     return call  # pyright: ignore[reportReturnType]
 

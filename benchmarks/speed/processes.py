@@ -186,7 +186,22 @@ def _program(program: str, points: int, batch: int, implementation: str) -> tupl
     return workload.registration(implementation, batched=batch > 1), (variables, *clouds)
 
 
+def all_reduces(core: int, **options) -> dict:
+    """What a training step sends, as one of the processes that share it, on this core."""
+    os.sched_setaffinity(0, {core})
+    from benchmarks.speed import sends
+
+    return sends.measure(**options)
+
+
+def stream(**options) -> dict:
+    """Memory along a stream of pairs."""
+    from benchmarks.speed import streams
+
+    return streams.measure(**options)
+
+
 if __name__ == "__main__":
-    tasks = (measure, train, register_pair, register)
+    tasks = (measure, train, register_pair, register, all_reduces, stream)
     task = {task.__name__: task for task in tasks}[sys.argv[1]]
     print(json.dumps(task(**json.load(sys.stdin))))

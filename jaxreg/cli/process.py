@@ -1,10 +1,14 @@
 """The process of a command: a program cache on disk, and memory pages; not for a library to set."""
 
+import contextlib
 import os
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import jax
+
+from jaxreg import _traced
 
 
 def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
@@ -15,14 +19,24 @@ def enable_compilation_cache(*, least_seconds: float = 0.3) -> None:
     JAX_COMPILATION_CACHE_DIR to choose another. If it cannot be made, nothing is kept.
     """
     if not cache_directory():
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        directory = root / "jaxreg" / "xla"
+        directory = _own_directory() / "xla"
         try:
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError:
             return
         jax.config.update("jax_compilation_cache_dir", str(directory))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", least_seconds)
+
+
+def _own_directory() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxreg"
+
+
+def traced_programs_kept() -> AbstractContextManager[None]:
+    """Traced programs are kept beside the compiled ones, where these are in our own directory."""
+    if cache_directory() != str(_own_directory() / "xla"):
+        return contextlib.nullcontext()
+    return _traced.kept_in(_own_directory() / "traced")
 
 
 def cache_directory() -> str | None:

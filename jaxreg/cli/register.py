@@ -313,7 +313,7 @@ def patience(*, spinner: bool = True) -> Iterator[None]:
     monitoring.register_event_listener(listen)
     try:
         waiting = Console(stderr=True, highlight=False).status("registering")
-        with waiting if spinner else contextlib.nullcontext():
+        with waiting if spinner else contextlib.nullcontext(), process.traced_programs_kept():
             yield
     finally:
         monitoring.unregister_event_listener(listen)

@@ -75,23 +75,24 @@ def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
     # A sum over points is a product with the mask: XLA:CPU reduces long columns slowly.
     weight = jnp.broadcast_to(mask, x.shape[:-1]).reshape(-1).astype(x.dtype)
     x = x.reshape(-1, x.shape[-1])
-    axes = _axes()
 
     def over_batch(values):
-        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), axes)
+        return _over_all(jnp.matmul(weight, values, precision=Precision.HIGHEST))
 
-    count = jnp.maximum(jax.lax.psum(jnp.sum(weight), axes), 1)
+    count = jnp.maximum(_over_all(jnp.sum(weight)), 1)
     mean = over_batch(x) / count
     # Two passes: E[x^2] - E[x]^2 cancels when the inlier network sees differences near zero.
     return mean, over_batch((x - mean[None, :]) ** 2) / count
 
 
-def _axes() -> tuple[str, ...]:
+def _over_all(values: Float[Array, "*c"]) -> Float[Array, "*c"]:
+    """The sum over the clouds of all devices."""
+    # One after the other: over both axes at once its derivative would send every cloud's part.
+    values = jax.lax.psum(values, BATCH_AXIS)
     try:
-        jax.lax.axis_index(DEVICE_AXIS)
-    except NameError:
-        return (BATCH_AXIS,)
-    return BATCH_AXIS, DEVICE_AXIS
+        return jax.lax.psum(values, DEVICE_AXIS)
+    except NameError:  # there is one device
+        return values
 
 
 class DGCNN(nn.Module):

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy import fft, ndimage
 
 _GRID = 256
 """Cells of a side of the raster."""
@@ -51,6 +50,8 @@ def placed(
 
     Points should lie evenly along their curves, and around the origin.
     """
+    from scipy import fft, ndimage  # pairs in space do without
+
     rim = float(np.linalg.norm(source.points, axis=1).max())
     low, high = reference.points.min(axis=0), reference.points.max(axis=0)
     cell = (2 * rim + float(np.max(high - low))) / (_GRID - 4) or 1.0
@@ -92,6 +93,8 @@ def _of_turns(
     source: Outline, turns: np.ndarray, against: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The best shifts of every turn: turn, place in the raster, score."""
+    from scipy import fft
+
     values = _directions(source.normals)
     rasters = np.stack(
         [

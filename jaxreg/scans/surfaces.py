@@ -235,7 +235,7 @@ def _program(search: SearchConfig, learned: bool):
         )
 
     network = jax.device_put(load_features()) if learned else None
-    return functools.partial(from_host(jax.jit(run)), network)
+    return functools.partial(from_host(jax.jit(run), told=(search,)), network)
 
 
 def refine_pose(problem: Problem, pose: RigidTransform) -> Refined:

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.paper import accuracy
-from benchmarks.speed import candidates, scaling, speed, stages
+from benchmarks.speed import candidates, many_pairs, parallel, scaling, speed, stages
 from benchmarks.speed import records as of_speed
 
 OPTIONS = speed.Options(points=(768, 1434), batch=8)
@@ -117,3 +117,35 @@ def test_scaling(records):
     }
     assert entry["rows"]["n2048"]["ms"] == pytest.approx(2048**2 * 1e-6)
     assert entry["rows"]["n256"]["compile"] == 2.5
+
+
+def test_the_end_of_a_curve_of_memory(records):
+    curve = [(1, 10.0, 400.0), (50, 11.0, 500.0), (100, 12.0, 501.0), (101, 12.0, 504.0)]
+    found = many_pairs.summary(curve)
+    assert found["ms"] == pytest.approx(20)
+    assert (found["first"], found["half"], found["last"], found["grown"]) == (400, 501, 504, 3)
+    told = {kind: {"curve": curve, "programs": 2} for kind in many_pairs.KINDS}
+    many_pairs.write(told)
+    assert records.read("many_pairs")["rows"]["executor"]["programs"] == 2
+    assert records.fits("many_pairs")
+
+
+def test_processes_that_train_together(records):
+    turns = {
+        "apart": [{"pairs": 10.0, "processor_ms": 200.0}, {"pairs": 8.0, "processor_ms": 210.0}],
+        "together": [{"pairs": 9.0, "processor_ms": 220.0}, {"pairs": 8.0, "processor_ms": 205.0}],
+    }
+    sent = {"sends": 68, "kilobytes": 300, "sends_ms": 8.0, "as_one_ms": 0.5, "process_s": 1.0}
+    parallel.write(turns, sent, parallel.Options(rounds=2))
+    setting = records.read("parallel")["setting"]
+    assert setting["ratio"] == pytest.approx(0.95)
+    assert setting["least_ratio"] == pytest.approx(0.9)
+    assert "process_s" not in setting
+    assert records.fits("parallel")
+
+
+def test_steps_are_counted_over_the_same_time(tmp_path):
+    log = tmp_path / "metrics.jsonl"
+    assert parallel.steps(log) == 0
+    log.write_text("{}\n{}\n{")
+    assert parallel.steps(log) == 2

@@ -1,0 +1,147 @@
+"""Programs as JAX traced them, on disk, so that the next process of the same command need not trace.
+
+Tracing and lowering takes longer than anything else in a short run: three times as long as reading the
+StableHLO that `jax.export` writes. XLA compiles that as it would the program, or reads what it compiled
+from its own cache. Off until a command says where to keep them; whatever cannot be kept is traced.
+"""
+
+import contextlib
+import hashlib
+import os
+import pickle
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+_lock = threading.RLock()  # a program that is traced may call another
+_folder: Path | None = None
+_programs: dict[Any, Callable[..., Any]] = {}
+
+
+@contextlib.contextmanager
+def kept_in(folder: Path) -> Iterator[None]:
+    """Keep programs in `folder` during the block; others must not be able to write there.
+
+    What the files hold is run, as with XLA's cache.
+    """
+    global _folder
+    before, _folder = _folder, folder / _version()
+    try:
+        yield
+    finally:
+        _folder = before
+
+
+def call(function: Callable[..., Any], told: tuple, arguments: tuple, static: dict) -> Any:
+    """``function(*arguments, **static)``, a jitted one, from its kept program if there may be one.
+
+    `told` is what the function closes over; one that closes over something and tells nothing is not
+    kept.
+    """
+    if _folder is None or (_closes_over(function) and not told):
+        return function(*arguments, **static)
+    leaves, tree = jax.tree.flatten(arguments)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return function(*arguments, **static)
+    call = _Call(function, told, tuple(sorted(static.items())), tree, tuple(map(_form, leaves)))
+    with _lock:
+        program = _programs.get((_folder, call))
+        if program is None:
+            program = _programs[_folder, call] = _program(call, _folder)
+    return program(*arguments, **static)
+
+
+class _Call(NamedTuple):
+    """All that a program follows from, besides `_version`."""
+
+    function: Callable[..., Any]
+    told: tuple
+    static: tuple[tuple[str, Any], ...]
+    tree: Any
+    forms: tuple[tuple[tuple[int, ...], str, bool], ...]
+
+    def name(self) -> str:
+        """A name for it in any process."""
+        words = self.function.__module__, self.function.__qualname__, *map(repr, self[1:])
+        return hashlib.sha256(repr(words).encode()).hexdigest()
+
+
+def _form(leaf: Any) -> tuple[tuple[int, ...], str, bool]:
+    """Shape, dtype and whether it is weak, as that of a Python number is."""
+    aval = jax.typeof(leaf)
+    return aval.shape, str(aval.dtype), aval.weak_type
+
+
+def _closes_over(function: Callable[..., Any]) -> bool:
+    return bool(getattr(getattr(function, "__wrapped__", None), "__closure__", None))
+
+
+def _program(call: _Call, folder: Path) -> Callable[..., Any]:
+    """The kept program of a call; made and kept if there is none, and the function if that fails."""
+    path = folder / call.name()
+    try:
+        from jax import export
+
+        try:
+            written, outputs = pickle.loads(path.read_bytes())
+        except Exception:  # noqa: BLE001 - not there, or of a process that was killed
+            written, outputs = _exported(call)
+            _write(path, pickle.dumps((written, outputs)))
+        run = jax.jit(export.deserialize(written).call)
+    except Exception:  # noqa: BLE001 - no flatbuffers, no space, an operation that cannot be exported
+        return call.function
+    result = jax.tree.structure(outputs)
+    return lambda *arguments, **_: jax.tree.unflatten(result, run(*jax.tree.leaves(arguments)))
+
+
+def _exported(call: _Call) -> tuple[bytes, Any]:
+    """The program of a call from leaves to leaves, and a tree of what it returns.
+
+    `jax.export` would have every record named to it that a program takes or returns.
+    """
+    from jax import export
+
+    trees = []
+
+    def flat(*leaves):
+        arguments = jax.tree.unflatten(call.tree, leaves)
+        found, structure = jax.tree.flatten(call.function(*arguments, **dict(call.static)))
+        trees.append(structure)
+        return found
+
+    forms = [
+        jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in call.forms
+    ]
+    written = bytes(export.export(jax.jit(flat))(*forms).serialize())
+    return written, jax.tree.unflatten(trees[0], range(trees[0].num_leaves))
+
+
+def _write(path: Path, content: bytes) -> None:
+    """In one step, since other processes may read and write the same."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(content)
+    os.replace(file.name, path)
+
+
+def _version() -> str:
+    """A name for all that a program follows from besides the call: our files, JAX, and its settings."""
+    root = Path(__file__).parent
+    files = sorted(
+        (str(path.relative_to(root)), stat.st_size, stat.st_mtime_ns)
+        for path in root.rglob("*.*")
+        if path.suffix != ".pyc" and (stat := path.stat())
+    )
+    settings = (
+        jax.__version__,
+        np.__version__,
+        jax.default_backend(),
+        jax.config.jax_enable_x64,  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
+    )
+    return hashlib.sha256(repr((files, settings)).encode()).hexdigest()[:16]
