@@ -1,14 +1,14 @@
 """Every picture of the documentation, from procedural shapes and the released weights.
 
-    python -m benchmarks.figures [--folder docs/images] [--only pairs noise matches arccos search reliability]
+    python -m benchmarks.figures [--folder docs/images] [--only pairs noise ... reliability pair_choice]
     python -m benchmarks.figures --only drift --runs runs/drift_default runs/drift_batch4 ...
 
 `pairs` and `noise`: pairs before and after, with the inlier confidence as colour. `matches`: the
 best match of points at the first step with the 1-NN cloud, with every point in the place of its own
 1-NN, and with a single neighbourhood, all with the same weights. `arccos`: the published form of
 MIE(R) beside the true angle. `search`: the stages of the search. `reliability`: how often poses of a
-given probability are right, as benchmarks/results/reliability.json says. `drift`: validation errors of runs of
-train.py.
+given probability are right, as benchmarks/results/reliability.json says. `pair_choice`: what trying the
+likeliest pairs alone costs and finds, of pair_choice.json there. `drift`: validation errors of runs of train.py.
 """
 
 import dataclasses
@@ -56,7 +56,15 @@ class Options:
     """Which pictures, and where to."""
 
     folder: str = "docs/images"
-    only: tuple[str, ...] = ("pairs", "noise", "matches", "arccos", "search", "reliability")
+    only: tuple[str, ...] = (
+        "pairs",
+        "noise",
+        "matches",
+        "arccos",
+        "search",
+        "reliability",
+        "pair_choice",
+    )
     weights: str = "modelnet40"
     seed: int = 0
     runs: tuple[str, ...] = ()
@@ -268,6 +276,29 @@ def draw_reliability(path: Path) -> None:
     figure.savefig(path, dpi=90, facecolor="white")
 
 
+def draw_pair_choice(path: Path) -> None:
+    """Share of the overlapping pairs that are tried over the share of all pairs that are tried."""
+    found = json.loads((record.FOLDER / "pair_choice.json").read_text("utf-8"))
+    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="black", lw=0.8, label="chosen at random")
+    for key, heading in found["columns"].items():
+        if key.endswith("_cost"):
+            name, rows = key.removesuffix("_cost"), found["rows"].values()
+            cost, recall = ([row[f"{name}_{what}"] for row in rows] for what in ("cost", "recall"))
+            axes.plot(cost, recall, "o-", ms=4, label=heading.removesuffix(": cost"))
+    axes.set(
+        xlim=(0, 1), ylim=(0, 1),
+        xlabel="share of all pairs that are registered",
+        ylabel="share of the overlapping pairs among them",
+        title=f"{', '.join(row['label'] for row in found['rows'].values())} partners for each scan",
+    )  # fmt: skip
+    axes.title.set_size(10)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, loc="lower right")
+    figure.savefig(path, dpi=90, facecolor="white")
+
+
 def draw(name: str, options: Options) -> None:
     path = Path(options.folder) / f"{name}.png"
     if name == "pairs":
@@ -285,6 +316,8 @@ def draw(name: str, options: Options) -> None:
         draw_search(path)
     elif name == "reliability":
         draw_reliability(path)
+    elif name == "pair_choice":
+        draw_pair_choice(path)
     else:
         {"matches": draw_matches, "arccos": draw_arccos, "drift": draw_drift}[name](options, path)
     print(path, flush=True)

@@ -7,12 +7,13 @@ scan_K.npz with `points`), or the fragments of 7Scenes with their official lists
 """
 
 import dataclasses
+import itertools
 import json
 import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import tyro
@@ -25,6 +26,9 @@ from jaxreg.data import data_root
 from jaxreg.data.seven_scenes import read_fragment
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.types import RigidTransform
+
+if TYPE_CHECKING:
+    from jaxreg.scans.result import ScanRegistration
 
 BINS = 10
 """Of equal width, in the calibration error and the reliability diagram."""
@@ -41,6 +45,7 @@ RIGHT = {
 }
 """Within how many degrees, and metres at the overlap's centroid, a pose is right: the truth of a
 data set is good to about a third of that."""
+SEEN_FROM_ORIGIN = ("balm", "redkitchen_frames", "kitti00", "opencalib")
 _LISTS = {"redkitchen_lomatch": "gt_3dlomatch.log", "redkitchen": "gt.log"}
 _FRAGMENTS = "7scene/7-scenes-redkitchen"
 _FRAGMENT_REACH = 0.05
@@ -147,18 +152,22 @@ class Options:
     """What to run."""
 
     data_root: str | None = None
-    sensors: tuple[str, ...] = tuple(RIGHT)
+    sensors: tuple[str, ...] = ()
+    """Which; none: all, with `viewpoint` those whose clouds are in the scanner's frame."""
+    viewpoint: bool = False
+    """Register twice, and the second time tell that the scanner stood at the origin."""
     record: bool = True
-    """Write benchmarks/results/sensors.json and reliability.json."""
+    """Write benchmarks/results/sensors.json and reliability.json; with `viewpoint` viewpoint.json."""
 
 
-def measure(root: Path, sensor: str) -> Iterator[dict]:
+def measure(root: Path, sensor: str, *, viewpoint: bool = False) -> Iterator[dict]:
     """One entry per pair: whether the pose is right, believed, and whether an alternative is right."""
     from jaxreg.scans.pair import register
 
+    place = np.zeros(3) if viewpoint and sensor in SEEN_FROM_ORIGIN else None
     for pair in true_pairs(root, sensor):
         start = time.perf_counter()
-        found = register(pair.source, pair.reference)
+        found = register(pair.source, pair.reference, viewpoint=place)
         seconds = time.perf_counter() - start
         right = pair.is_right(found.transform)
         listed = any(pair.is_right(other.transform) for other in found.alternatives)
@@ -169,8 +178,22 @@ def measure(root: Path, sensor: str) -> Iterator[dict]:
             "listed": right or listed,
             "success": found.success,
             "probability": found.probability,
+            "nees": nees(found, pair) if right else None,
             "seconds": seconds,
         }
+
+
+def nees(found: "ScanRegistration", pair: TruePair) -> float:
+    """Squared error over covariance, for each of six degrees of freedom; 1 where sigma is right.
+
+    The error of the truth itself is in it.
+    """
+    assert pair.truth is not None
+    centre = pair.reference.mean(axis=0)
+    turn = pair.truth[:3, :3] @ found.rotation.T
+    shift = pair.truth[:3, 3] - centre - turn @ (found.translation - centre)
+    error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift])
+    return float(error @ np.linalg.solve(found.covariance, error) / 6)
 
 
 def summary(entries: list[dict]) -> dict:
@@ -184,8 +207,13 @@ def summary(entries: list[dict]) -> dict:
         "believed": int(np.sum(right & success)),
         "wrong": int(np.sum(~right & success)),
         "calibration": calibration_error(entries),
+        "nees": _median([e["nees"] for e in entries if e["nees"] is not None]),
         "seconds": float(np.median([e["seconds"] for e in entries])),
     }
+
+
+def _median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def calibration_error(entries: list[dict]) -> float:
@@ -218,6 +246,7 @@ COLUMNS = {
     "believed": "right and called a success",
     "wrong": "wrong and called a success",
     "calibration": "calibration error",
+    "nees": "median NEES a degree of freedom",
     "seconds": "median s",
 }
 
@@ -229,15 +258,27 @@ def main(options: Options) -> None:
         raise SystemExit("no data: set $JAXREG_DATA or give --data-root.")
     process.enable_compilation_cache()
     rows, everything = {}, []
-    for sensor in options.sensors:
-        entries = list(measure(root, sensor))
+    sensors = options.sensors or (SEEN_FROM_ORIGIN if options.viewpoint else tuple(RIGHT))
+    told = {"": False} | ({", told where the scanner stood": True} if options.viewpoint else {})
+    for sensor, (words, viewpoint) in itertools.product(sensors, told.items()):
+        entries = list(measure(root, sensor, viewpoint=viewpoint))
         everything += entries
         for key, label, low in (("low", "overlap below .3", True), ("high", ".3 and more", False)):
             if group := [e for e in entries if e["low"] is low]:
-                rows[f"{sensor}_{key}"] = {"label": f"{sensor}, {label}"} | summary(group)
-                print(rows[f"{sensor}_{key}"], flush=True)
+                name = f"{sensor}_{key}{'_told' * viewpoint}"
+                rows[name] = {"label": f"{sensor}, {label}{words}"} | summary(group)
+                print(rows[name], flush=True)
     if options.record:
         command = record.command("benchmarks.scans.sensors")
+        if options.viewpoint:
+            record.write(
+                "viewpoint",
+                question="What does it gain to know where the scanner stood?",
+                command=command,
+                columns=COLUMNS,
+                rows=rows,
+            )
+            return
         record.write(
             "sensors",
             question="How many pairs of real scans of other sensors are registered?",

@@ -27,8 +27,12 @@ _MODEL = 0.3
 """What scans of one place differ by beyond their noise (moved things, bent depth, a moving sensor), in
 reaches (`max_correspondence_distance`): one standard deviation of a pair's translation."""
 _BY_CHANCE = 0.05
-"""How often three pairs, one of them wrong, close a triangle. A foreign scan that fits one view of a
-thing fits the next view in the same wrong way, so it is not seldom."""
+"""How often three pairs, one of them wrong, close a triangle at least: a foreign scan that fits one
+view of a thing fits the next view in the same wrong way."""
+_EM_ROUNDS, _AS_IF = 50, 2.0
+"""Rounds of the estimate of a share, and the observations that what is expected counts for."""
+_VOTE = 3.0
+"""Largest log odds with which one pair speaks for or against another."""
 _CLOSED = 0.98
 """How often three right pairs close one."""
 _AMONG_RIVALS = 0.5
@@ -74,18 +78,28 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
     """Believe or refuse every pair, and solve for the poses of all scans."""
     count = len(sizes.radius)
     graph, unit = pair_graph(relations, sizes)
-    prior = np.array([relation.probability for relation in relations], np.float64)
+    how = np.array([relation.how for relation in relations])
+    prior = _at_base_rates(np.array([r.probability for r in relations], np.float64), how)
     looked_at = prior >= _CONSIDERED
     graph = graph._replace(mask=looked_at)
-    found = triangles(graph.source[looked_at], graph.reference[looked_at], count)
-    found = np.flatnonzero(looked_at)[found]
+    # A pose that other pairs gave closes their triangles, whether these are right or not.
+    witnesses = np.flatnonzero(looked_at & (how != "start"))
+    found = triangles(graph.source[witnesses], graph.reference[witnesses], count)
+    found = witnesses[found]
+    closed = triangle_errors(graph, found) <= CHI_SQUARED
     rivals = np.array([relation.rivals >= RIVAL for relation in relations], bool)
-    by_chance = np.where(rivals[found].sum(axis=1) >= 2, _AMONG_RIVALS, _BY_CHANCE)
-    posterior = _posterior(prior, found, triangle_errors(graph, found), by_chance)
+    by_chance = np.full(len(found), _closed_by_chance(prior, found, closed))
+    by_chance[rivals[found].sum(axis=1) >= 2] = _AMONG_RIVALS
+    posterior = _posterior(prior, found, closed, by_chance)
     poses, errors = _robust_poses(graph, posterior, count)
     agrees = errors <= CHI_SQUARED
-    posterior = _confirmed(graph, posterior, agrees, count)
+    posterior = _confirmed(
+        graph, posterior, agrees & ((how != "start") | (prior >= 0.5)), agrees, count
+    )
     used = looked_at & agrees & (posterior >= SURE)
+    refuted = _refuted(graph, used, prior, how == "start", count)
+    posterior = np.where(refuted, np.minimum(posterior, 0.01), posterior)
+    used &= ~refuted
     group = _groups(graph, used, count)
     used &= (group[graph.source] >= 0) & (group[graph.source] == group[graph.reference])
     first = np.array([np.flatnonzero(group == k)[0] for k in range(group.max() + 1)], np.int64)
@@ -137,16 +151,68 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
     return PoseGraph(source, reference, transform, np.linalg.inv(covariance), everything), unit
 
 
+def _at_base_rates(probability: Float[np.ndarray, "e"], how: np.ndarray) -> np.ndarray:
+    """The probabilities where right pairs are seldom: of hundreds of pairs that were tried few may be.
+
+    `register` gives the odds of a pair that is as likely right as wrong before it is looked at. The
+    share of right ones among the pairs that were searched in one way is estimated from their
+    probabilities (Saerens, Latinne and Decaestecker, 2002), never as more than a half. A pair with a
+    given start is no random one, and stays.
+    """
+    odds = np.exp(_log_odds(probability))
+    for kind in ("search", "wide search"):
+        chosen = odds[how == kind]
+        rate = 0.5
+        for _ in range(_EM_ROUNDS):
+            at_rate = chosen * rate / (1 - rate)
+            right = np.sum(at_rate / (1 + at_rate))
+            rate = min(0.5, (right + _AS_IF) / (len(chosen) + 2 * _AS_IF))
+        odds[how == kind] *= rate / (1 - rate)
+    return odds / (1 + odds)
+
+
+def _closed_by_chance(
+    prior: Float[np.ndarray, "e"], found: Int[np.ndarray, "t 3"], closed: Bool[np.ndarray, "t"]
+) -> float:
+    """How often triangles close that have a wrong pair: where places repeat, wrong pairs agree."""
+    wrong = 1 - prior[found].prod(axis=1)
+    rate = (np.sum(wrong * closed) + _AS_IF * _BY_CHANCE) / (np.sum(wrong) + _AS_IF)
+    return float(np.clip(rate, _BY_CHANCE, _AMONG_RIVALS))
+
+
+def _refuted(
+    graph: PoseGraph,
+    used: Bool[np.ndarray, "e"],
+    prior: Float[np.ndarray, "e"],
+    given: Bool[np.ndarray, "e"],
+    count: int,
+) -> Bool[np.ndarray, "e"]:
+    """Pairs that alone hold two parts together, whose scans disagree where these parts lay them.
+
+    The pairs with a `given` start are such scans, and their log odds are the votes.
+    """
+    refuted = np.zeros(len(used), bool)
+    votes = np.clip(_log_odds(prior), -_VOTE, _VOTE)
+    for edge in np.flatnonzero(_bridges(graph, used, count)):
+        rest = np.flatnonzero(used & (np.arange(len(used)) != edge))
+        label = components(count, graph.source[rest], graph.reference[rest])
+        ends = label[graph.source[edge]], label[graph.reference[edge]]
+        sides = np.sort(np.stack([label[graph.source], label[graph.reference]]), axis=0)
+        across = given & (sides[0] == min(ends)) & (sides[1] == max(ends))
+        across[edge] = False
+        refuted[edge] = across.any() and votes[across].sum() < 0
+    return refuted
+
+
 def _posterior(
     prior: Float[np.ndarray, "e"],
     found: Int[np.ndarray, "t 3"],
-    error: Float[np.ndarray, "t"],
+    closed: Bool[np.ndarray, "t"],
     by_chance: Float[np.ndarray, "t"],
 ) -> Float[np.ndarray, "e"]:
     """The probability of every pair given which triangles close (a few rounds of belief)."""
     start = _log_odds(prior)
     odds = start
-    closed = error <= CHI_SQUARED
     for _ in range(_ROUNDS):
         chance = 1 / (1 + np.exp(-odds))
         said, doubt = np.zeros(found.shape), np.zeros(found.shape)
@@ -202,15 +268,15 @@ def _tree(graph: PoseGraph, edges, posterior, roots, count: int) -> RigidTransfo
     return tree_poses(count, graph, edges[tree], roots)
 
 
-def _confirmed(graph: PoseGraph, posterior, agrees, count: int) -> np.ndarray:
-    """Pairs that agree with the poses that sure ones give are as sure as these.
+def _confirmed(graph: PoseGraph, posterior, counts, agrees, count: int) -> np.ndarray:
+    """Pairs that agree with the poses that sure ones give are as sure as these, of those that `counts`.
 
     A pair that is the only one between two parts agrees in any case, which says nothing.
     """
     agreeing = graph.mask & agrees
     sure = agreeing & (posterior >= SURE)
     label = components(count, graph.source[sure], graph.reference[sure])
-    inside = agreeing & ~_bridges(graph, sure, count)
+    inside = agreeing & counts & ~_bridges(graph, sure, count)
     inside &= label[graph.source] == label[graph.reference]
     return np.where(
         inside,
