@@ -29,10 +29,12 @@ reaches (`max_correspondence_distance`): one standard deviation of a pair's tran
 _BY_CHANCE = 0.05
 """How often three pairs, one of them wrong, close a triangle at least: a foreign scan that fits one
 view of a thing fits the next view in the same wrong way."""
+_UNLIKELY = 0.1
 _EM_ROUNDS, _AS_IF = 50, 2.0
 """Rounds of the estimate of a share, and the observations that what is expected counts for."""
 _VOTE = 3.0
-"""Largest log odds with which one pair speaks for or against another."""
+"""Largest log odds with which a pair speaks for or against the one that lays its scans over each
+other."""
 _CLOSED = 0.98
 """How often three right pairs close one."""
 _AMONG_RIVALS = 0.5
@@ -79,7 +81,7 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
     count = len(sizes.radius)
     graph, unit = pair_graph(relations, sizes)
     how = np.array([relation.how for relation in relations])
-    prior = _at_base_rates(np.array([r.probability for r in relations], np.float64), how)
+    prior = _at_base_rate(np.array([r.probability for r in relations], np.float64), how)
     looked_at = prior >= _CONSIDERED
     graph = graph._replace(mask=looked_at)
     # A pose that other pairs gave closes their triangles, whether these are right or not.
@@ -93,9 +95,8 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
     posterior = _posterior(prior, found, closed, by_chance)
     poses, errors = _robust_poses(graph, posterior, count)
     agrees = errors <= CHI_SQUARED
-    posterior = _confirmed(
-        graph, posterior, agrees & ((how != "start") | (prior >= 0.5)), agrees, count
-    )
+    # Nor is a pair with a start a witness that agrees with where it was put, unless it fits there.
+    posterior = _confirmed(graph, posterior, (how != "start") | (prior >= 0.5), agrees, count)
     used = looked_at & agrees & (posterior >= SURE)
     refuted = _refuted(graph, used, prior, how == "start", count)
     posterior = np.where(refuted, np.minimum(posterior, 0.01), posterior)
@@ -118,7 +119,7 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
         _about_centres(covariance, solved.poses, unit),
         posterior,
         used,
-        tuple(_refusals(relations, used, agrees, posterior, group)),
+        tuple(_refusals(relations, used, agrees, refuted, posterior)),
     )
 
 
@@ -151,31 +152,31 @@ def pair_graph(relations: list[Relation], sizes: Sizes) -> tuple[PoseGraph, floa
     return PoseGraph(source, reference, transform, np.linalg.inv(covariance), everything), unit
 
 
-def _at_base_rates(probability: Float[np.ndarray, "e"], how: np.ndarray) -> np.ndarray:
-    """The probabilities where right pairs are seldom: of hundreds of pairs that were tried few may be.
+def _at_base_rate(probability: Float[np.ndarray, "e"], how: np.ndarray) -> np.ndarray:
+    """The probabilities where right pairs are seldom: a wide search tries hundreds, and few are right.
 
     `register` gives the odds of a pair that is as likely right as wrong before it is looked at. The
-    share of right ones among the pairs that were searched in one way is estimated from their
-    probabilities (Saerens, Latinne and Decaestecker, 2002), never as more than a half. A pair with a
-    given start is no random one, and stays.
+    share of right ones among the pairs of the wide search is estimated from their probabilities
+    (Saerens, Latinne and Decaestecker, 2002), never as more than a half.
     """
-    odds = np.exp(_log_odds(probability))
-    for kind in ("search", "wide search"):
-        chosen = odds[how == kind]
-        rate = 0.5
-        for _ in range(_EM_ROUNDS):
-            at_rate = chosen * rate / (1 - rate)
-            right = np.sum(at_rate / (1 + at_rate))
-            rate = min(0.5, (right + _AS_IF) / (len(chosen) + 2 * _AS_IF))
-        odds[how == kind] *= rate / (1 - rate)
+    chosen = how == "wide search"
+    odds, rate = np.exp(_log_odds(probability)), 0.5
+    for _ in range(_EM_ROUNDS):
+        at_rate = odds[chosen] * rate / (1 - rate)
+        right = np.sum(at_rate / (1 + at_rate))
+        rate = min(0.5, (right + _AS_IF) / (chosen.sum() + 2 * _AS_IF))
+    odds = np.where(chosen, odds * rate / (1 - rate), odds)
     return odds / (1 + odds)
 
 
 def _closed_by_chance(
     prior: Float[np.ndarray, "e"], found: Int[np.ndarray, "t 3"], closed: Bool[np.ndarray, "t"]
 ) -> float:
-    """How often triangles close that have a wrong pair: where places repeat, wrong pairs agree."""
-    wrong = 1 - prior[found].prod(axis=1)
+    """How often triangles close that have a wrong pair: where places repeat, wrong pairs agree.
+
+    Counted where a pair is most likely wrong, whatever the triangle says.
+    """
+    wrong = prior[found].min(axis=1, initial=1.0) < _UNLIKELY
     rate = (np.sum(wrong * closed) + _AS_IF * _BY_CHANCE) / (np.sum(wrong) + _AS_IF)
     return float(np.clip(rate, _BY_CHANCE, _AMONG_RIVALS))
 
@@ -392,7 +393,7 @@ def _chances(graph: PoseGraph, used, posterior, group, first) -> Float[np.ndarra
     return np.where(group < 0, 0.0, np.exp(-length))
 
 
-def _refusals(relations, used, agrees, posterior, group):
+def _refusals(relations, used, agrees, refuted, posterior):
     for k, relation in enumerate(relations):
         if used[k]:
             yield ""
@@ -400,6 +401,8 @@ def _refusals(relations, used, agrees, posterior, group):
             yield relation.reason
         elif not agrees[k]:
             yield "It contradicts pairs that agree among each other."
+        elif refuted[k]:
+            yield "The scans on its two sides do not fit each other where it lays them."
         else:
             yield (
                 "Nothing confirms it, and alone it is not sure enough: "

@@ -134,6 +134,59 @@ def test_pairs_with_rivals_do_not_confirm_each_other(seed):
     assert place(anchored, sizes(6)).used[0]
 
 
+def across(rng, truth, probability):
+    """Pairs of the first ring with the second, from where the one pair between them lays them."""
+    return [
+        dataclasses.replace(
+            relation(rng, truth, 4 + k, k, probability=probability), how="start", reason="Unlikely."
+        )
+        for k in range(3)
+    ]
+
+
+@pytest.mark.parametrize(("probability", "groups"), [(0.05, 2), (0.8, 1)])
+def test_a_single_link_is_refused_if_the_scans_that_it_joins_do_not_fit(probability, groups, seed):
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 8)
+    link = relation(rng, truth, 7, 3, probability=0.98)
+    relations = [*ring(rng, truth, range(4)), *ring(rng, truth, range(4, 8)), link]
+    assert len(place(relations, sizes(8)).members()) == 1  # nothing speaks against it
+    found = place([*relations, *across(rng, truth, probability)], sizes(8))
+    assert len(found.members()) == groups
+    if groups == 2:
+        assert "do not fit each other" in found.refusal[len(relations) - 1]
+
+
+def test_where_a_wide_search_finds_little_it_is_believed_less(seed):
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 40)
+
+    def wide(k, probability):
+        found = relation(rng, truth, 2 * k + 1, 2 * k, probability=probability)
+        return dataclasses.replace(found, how="wide search")
+
+    alone = place([wide(0, 0.95)], sizes(40))
+    assert alone.used.all()
+    among = place([wide(0, 0.95), *(wide(k, 0.03) for k in range(1, 20))], sizes(40))
+    assert not among.used.any()
+    # By hand: 20 pairs with odds 19 and 0.031, of which about one and a half are right.
+    assert 0.4 < among.posterior[0] < 0.8
+    assert place([wide(k, 0.95) for k in range(20)], sizes(40)).used.all()
+
+
+def test_triangles_say_little_where_wrong_pairs_close_them(seed):
+    """In a corridor a pair that is a room off agrees with two others that are."""
+    rng = np.random.default_rng(seed)
+    truth = poses(rng, 12)
+    weak = ring(rng, truth, range(6), probability=0.4)
+    assert place(weak, sizes(12)).members() == (tuple(range(6)),)
+    doubtful = [
+        relation(rng, truth, i, j, probability=0.05)
+        for i in range(6, 12) for j in range(6, 12) if i != j
+    ]  # fmt: skip
+    assert place([*weak, *doubtful], sizes(12)).members() == ()
+
+
 def test_one_sure_pair_is_enough_and_says_how_sure(seed):
     rng = np.random.default_rng(seed)
     truth = poses(rng, 2)

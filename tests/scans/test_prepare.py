@@ -92,7 +92,7 @@ def test_a_level_is_examined_once_and_its_padding_does_not_count(rng):
     level = prepare.prepare(plane).fine
     found = level.examined
     assert level.examined is found
-    np.testing.assert_array_equal(found.mask, np.arange(512) < 300)
+    np.testing.assert_array_equal(found.mask, np.arange(len(found.mask)) < 300)
     # The unit of the level, in which the spacing of the same points is that of the trees.
     assert float(found.spacing) == pytest.approx(level.spacing, rel=0.01)
     np.testing.assert_allclose(found.rarity[:300], 1, rtol=1e-6)
