@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 _lock = threading.RLock()  # a program that is traced may call another
 _folder: Path | None = None
@@ -46,7 +47,7 @@ def call(function: Callable[..., Any], told: tuple, arguments: tuple, static: di
     if _folder is None or (_closes_over(function) and not told):
         return function(*arguments, **static)
     leaves, tree = jax.tree.flatten(arguments)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
         return function(*arguments, **static)
     call = _Call(function, told, tuple(sorted(static.items())), tree, tuple(map(_form, leaves)))
     with _lock:
@@ -92,7 +93,7 @@ def _program(call: _Call, folder: Path) -> Callable[..., Any]:
         except Exception:  # noqa: BLE001 - not there, or of a process that was killed
             written, outputs = _exported(call)
             _write(path, pickle.dumps((written, outputs)))
-        run = jax.jit(export.deserialize(written).call)
+        run = jax.jit(export.deserialize(bytearray(written)).call)
     except Exception:  # noqa: BLE001 - no flatbuffers, no space, an operation that cannot be exported
         return call.function
     result = jax.tree.structure(outputs)

@@ -1,5 +1,6 @@
 """Register many scans: every one in the frame of its group, from registrations of pairs."""
 
+import collections
 import concurrent.futures
 import contextlib
 import dataclasses
@@ -28,6 +29,8 @@ _NEAREST = 4
 """Of more scans each is tried with so many that look most alike, and later with more."""
 _STIFF = 6
 """Pairs that hold a placed scan; with fewer, it is also registered from where it lies."""
+_WIDER = 4
+"""How often scans outside the largest group are looked for more widely."""
 _RETRIES = 2
 """How often a pair is tried again whose worker died."""
 _OVERLAP = 0.1
@@ -290,13 +293,16 @@ def _find_pairs(run: _Run, times: np.ndarray | None, starts: list[np.ndarray | N
     if any(start is not None for start in starts):
         run.do(_from_starts(run, starts), "registering pairs from their start")
     run.do(_first_pairs(run, likeness, times), "registering pairs")
-    for _ in range(2):
+    for _ in range(_WIDER):
         placement = placing.place(run.relations, run.sizes)
         run.do(_nearby(run, placement), "registering neighbours")
         placement = placing.place(run.relations, run.sizes)
         if (placement.group == 0).all():
             return
-        run.do(_wider(run, placement, likeness), "searching more widely")
+        tasks = _wider(run, placement, likeness)
+        if not tasks:
+            break
+        run.do(tasks, "searching more widely")
     run.do(_nearby(run, placing.place(run.relations, run.sizes)), "registering neighbours")
 
 
@@ -334,12 +340,14 @@ def _from_starts(run: _Run, starts: list[np.ndarray | None]) -> list[Task]:
 def _nearby(run: _Run, placement: Placement) -> list[Task]:
     """Placed scans that should overlap, whose pair is not used: from where they lie.
 
-    Those that share most first, until each scan is held by several.
+    Those that share most first, until each scan is held by several, and so is every two parts.
     """
     held = np.zeros(len(run.prepared), int)
-    done = set()
+    between: collections.Counter[tuple[int, int]] = collections.Counter()
+    done, part = set(), placement.part.tolist()
     for relation, used in zip(run.relations, placement.used, strict=True):
         held[[relation.source, relation.reference]] += used
+        between[_pair(part[relation.source], part[relation.reference])] += used
         if used or relation.how == "start":
             done.add((relation.reference, relation.source))
     matrices = matrix_of(placement.poses)
@@ -347,9 +355,12 @@ def _nearby(run: _Run, placement: Placement) -> list[Task]:
     for members in placement.members():
         found = proposals.overlaps(run.prepared, {k: matrices[k] for k in members})
         for pair in sorted(found, key=lambda pair: (-found[pair], pair)):
-            if found[pair] < _OVERLAP or pair in done or held[list(pair)].min() >= _STIFF:
+            parts = _pair(part[pair[0]], part[pair[1]])
+            stiff = held[list(pair)].min() if parts[0] == parts[1] else between[parts]
+            if found[pair] < _OVERLAP or pair in done or stiff >= _STIFF:
                 continue
             held[list(pair)] += 1
+            between[parts] += 1
             start = np.linalg.inv(matrices[pair[0]]) @ matrices[pair[1]]
             tasks.append(Task(pair[1], pair[0], "start", start))
     return tasks

@@ -32,9 +32,9 @@ view of a thing fits the next view in the same wrong way."""
 _UNLIKELY = 0.1
 _EM_ROUNDS, _AS_IF = 50, 2.0
 """Rounds of the estimate of a share, and the observations that what is expected counts for."""
-_VOTE = 3.0
-"""Largest log odds with which a pair speaks for or against the one that lays its scans over each
-other."""
+_VOTE, _PART = 3.0, 3
+"""Largest log odds with which a pair speaks for or against those that lay its scans over each other,
+and the scans of a part of which so many pairs can be expected that their silence says something."""
 _CLOSED = 0.98
 """How often three right pairs close one."""
 _AMONG_RIVALS = 0.5
@@ -58,7 +58,8 @@ class Placement(NamedTuple):
     `group` numbers the groups by size, -1 for a scan alone. `probability` is that of a scan's pose in
     its group, `covariance` is about its own centre, in the axes of its group (NaN if alone).
     `posterior` is the probability of each pair in view of all others, `used` says which pairs the
-    poses come from, `refusal` why the others do not count.
+    poses come from, `refusal` why the others do not count. `part` numbers the parts that more than one
+    sure pair holds together: between parts of a group a single mistake would be enough.
     """
 
     poses: RigidTransform
@@ -68,6 +69,7 @@ class Placement(NamedTuple):
     posterior: Float[np.ndarray, "e"]
     used: Bool[np.ndarray, "e"]
     refusal: tuple[str, ...]
+    part: Int[np.ndarray, "n"]
 
     def members(self) -> tuple[tuple[int, ...], ...]:
         """The scans of every group, the largest group first."""
@@ -120,6 +122,7 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
         posterior,
         used,
         tuple(_refusals(relations, used, agrees, refuted, posterior)),
+        _parts(graph, used & (prior >= SURE), count),
     )
 
 
@@ -188,21 +191,44 @@ def _refuted(
     given: Bool[np.ndarray, "e"],
     count: int,
 ) -> Bool[np.ndarray, "e"]:
-    """Pairs that alone hold two parts together, whose scans disagree where these parts lay them.
+    """Pairs that lay two parts over each other whose scans do not fit there.
 
-    The pairs with a `given` start are such scans, and their log odds are the votes.
+    Parts hang together by sure pairs. Used pairs between two of them, and pairs that were registered
+    from where these lay them (a `given` start), vote with their log odds. Of parts that one sure pair
+    joins it is refused; of larger ones that only pairs join which agree, all of these.
     """
     refuted = np.zeros(len(used), bool)
     votes = np.clip(_log_odds(prior), -_VOTE, _VOTE)
-    for edge in np.flatnonzero(_bridges(graph, used, count)):
-        rest = np.flatnonzero(used & (np.arange(len(used)) != edge))
+    voting = used | given
+    sure = used & (prior >= SURE)
+    for edge in np.flatnonzero(_bridges(graph, sure, count)):
+        rest = np.flatnonzero(sure & (np.arange(len(used)) != edge))
         label = components(count, graph.source[rest], graph.reference[rest])
-        ends = label[graph.source[edge]], label[graph.reference[edge]]
-        sides = np.sort(np.stack([label[graph.source], label[graph.reference]]), axis=0)
-        across = given & (sides[0] == min(ends)) & (sides[1] == max(ends))
-        across[edge] = False
-        refuted[edge] = across.any() and votes[across].sum() < 0
+        between = _between(graph, label, label[[graph.source[edge], graph.reference[edge]]])
+        if votes[between & voting].sum() < 0:
+            refuted |= between & used
+    rest = np.flatnonzero(sure & ~refuted)
+    label = components(count, graph.source[rest], graph.reference[rest])
+    large = np.bincount(label) >= _PART
+    pairs = np.stack([label[graph.source], label[graph.reference]], axis=1)
+    apart = used & (pairs[:, 0] != pairs[:, 1]) & large[pairs].all(axis=1)
+    for ends in np.unique(np.sort(pairs[apart], axis=1), axis=0):
+        between = _between(graph, label, ends)
+        if votes[between & voting].sum() < 0:
+            refuted |= between & used
     return refuted
+
+
+def _parts(graph: PoseGraph, sure: Bool[np.ndarray, "e"], count: int) -> Int[np.ndarray, "n"]:
+    """What hangs together by sure pairs, without those that are the only way between two parts."""
+    firm = np.flatnonzero(sure & ~_bridges(graph, sure, count))
+    return components(count, graph.source[firm], graph.reference[firm])
+
+
+def _between(graph: PoseGraph, label: np.ndarray, ends: np.ndarray) -> Bool[np.ndarray, "e"]:
+    """Which pairs are of one scan with the first label of `ends` and one with the second."""
+    sides = np.sort(np.stack([label[graph.source], label[graph.reference]]), axis=0)
+    return (sides[0] == min(ends)) & (sides[1] == max(ends))
 
 
 def _posterior(
