@@ -102,8 +102,9 @@ def _moved_viewpoint(
         return {}
     # -0.0 and 0.0 are one number.
     x, y, z, w = (Rotation.from_matrix(turn_of(rotation)) * attitude).as_quat(canonical=True) + 0.0
-    numbers = [*(rotation @ place + translation + 0.0).tolist(), w, x, y, z]
-    return {"VIEWPOINT": [f"{number:.9g}" for number in numbers]}
+    moved = rotation @ place + translation + 0.0
+    words = [f"{number:.15g}" for number in moved] + [f"{number:.9g}" for number in (w, x, y, z)]
+    return {"VIEWPOINT": words}
 
 
 def _kind(kind: np.dtype, points: np.ndarray) -> np.dtype:

@@ -97,6 +97,25 @@ def test_what_is_not_stable_is_told(targets, tmp_path, run, told, said):
     assert "Traceback" not in err
 
 
+def test_a_viewpoint_of_the_file_needs_a_file_that_says_it(targets, tmp_path, run):
+    source, reference = targets
+    status, _, err = run("register", source, reference, "--viewpoint", "file")
+    assert status == BAD_INPUT
+    assert "does not say where the scanner stood" in err
+    files = [tmp_path / "a.pcd", tmp_path / "b.pcd"]
+    for path, cloud in zip(files, targets, strict=True):
+        io.write_cloud(path, io.read_cloud(cloud))
+    # A few targets hide nothing: told or not, the pose is the same.
+    for told in ("unknown", "origin", "file"):
+        options = "--viewpoint", told, "--json", tmp_path / f"{told}.json"
+        assert run("register", *files, *options)[0] == SUCCESS, told
+    poses = [
+        json.loads((tmp_path / f"{told}.json").read_text())["transformation"]
+        for told in ("unknown", "origin")
+    ]
+    assert poses[0] == poses[1]
+
+
 @pytest.mark.parametrize("separator", [",", " ", ";"])
 def test_files_of_two_columns_are_in_the_plane(tmp_path, run, separator):
     stems = np.random.default_rng(3).uniform(0, 50, (20, 2))
