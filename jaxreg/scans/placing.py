@@ -30,9 +30,11 @@ _BY_CHANCE = 0.05
 """How often three pairs, one of them wrong, close a triangle at least: a foreign scan that fits one
 view of a thing fits the next view in the same wrong way."""
 _UNLIKELY = 0.1
+_ENOUGH = 30
+"""Pairs, or triangles, from which a share is estimated; of fewer it is taken as usual."""
 _EM_ROUNDS, _AS_IF = 50, 2.0
 """Rounds of the estimate of a share, and the observations that what is expected counts for."""
-_VOTE, _PART = 3.0, 3
+_VOTE, _PART = 3.0, 5
 """Largest log odds with which a pair speaks for or against those that lay its scans over each other,
 and the scans of a part of which so many pairs can be expected that their silence says something."""
 _CLOSED = 0.98
@@ -163,6 +165,8 @@ def _at_base_rate(probability: Float[np.ndarray, "e"], how: np.ndarray) -> np.nd
     (Saerens, Latinne and Decaestecker, 2002), never as more than a half.
     """
     chosen = how == "wide search"
+    if chosen.sum() < _ENOUGH:
+        return probability
     odds, rate = np.exp(_log_odds(probability)), 0.5
     for _ in range(_EM_ROUNDS):
         at_rate = odds[chosen] * rate / (1 - rate)
@@ -180,6 +184,8 @@ def _closed_by_chance(
     Counted where a pair is most likely wrong, whatever the triangle says.
     """
     wrong = prior[found].min(axis=1, initial=1.0) < _UNLIKELY
+    if wrong.sum() < _ENOUGH:
+        return _BY_CHANCE
     rate = (np.sum(wrong * closed) + _AS_IF * _BY_CHANCE) / (np.sum(wrong) + _AS_IF)
     return float(np.clip(rate, _BY_CHANCE, _AMONG_RIVALS))
 
