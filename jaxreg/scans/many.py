@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.geometry.clouds import check_pose
-from jaxreg.scans import placing, proposals, stored
+from jaxreg.scans import placing, prepare, proposals, stored
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.joint import JointRefinement, refine_jointly
 from jaxreg.scans.placing import Placement, Sizes
-from jaxreg.scans.prepare import Prepared, prepare, voxel_reduced
+from jaxreg.scans.prepare import Prepared, voxel_reduced
 from jaxreg.scans.relation import How, Relation, Task, WorkFolder, register_files, register_task
 from jaxreg.scans.result import matrix_of
 from jaxreg.types import RigidTransform
@@ -173,7 +173,12 @@ def register_many(
     for k, cloud in enumerate(clouds):
         report(0, 0, f"preparing {names[k]}")
         place = None if viewpoints is None else viewpoints[k]
-        prepared.append(_prepared(cloud, names[k], place, nonfinite, strays, config))
+        prepared.append(
+            prepare.prepared(
+                cloud, viewpoint=place, nonfinite=nonfinite, strays=strays, config=config,
+                name=names[k], caller="jaxreg.register_many",
+            )
+        )  # fmt: skip
     with _runner(prepared, config, work, executor, workers) as runner:
         run = _Run(prepared, names, runner, report, [])
         _find_pairs(run, times, starts)
@@ -224,23 +229,6 @@ def _checked_starts(initial: Sequence[object] | None, count: int) -> list[np.nda
         checked = check_pose(pose, f"initial[{k}]")
         starts.append(matrix_of(checked))
     return starts
-
-
-def _prepared(
-    cloud: object, name: str, viewpoint, nonfinite, strays, config: RegisterConfig
-) -> Prepared:
-    if isinstance(cloud, Prepared):
-        if cloud.config != config:
-            raise ValueError(
-                f"{name} was prepared with another configuration: give jaxreg.prepare and "
-                "jaxreg.register_many the same config."
-            )
-        if viewpoint is not None:
-            raise ValueError(f"{name} is prepared: give its viewpoint to jaxreg.prepare.")
-        return cloud
-    return prepare(
-        cloud, viewpoint=viewpoint, nonfinite=nonfinite, strays=strays, config=config, name=name
-    )
 
 
 _Runner = Callable[[list[Task]], Iterator[Relation]]

@@ -65,7 +65,15 @@ def register(
     facts = known_of(known, up, max_rotation_deg)
     start = None if initial is None else facts.allowed(check_pose(initial, "initial"))
     first, second = (
-        _prepared(cloud, name, place, nonfinite, strays, config)
+        prepare.prepared(
+            cloud,
+            viewpoint=place,
+            nonfinite=nonfinite,
+            strays=strays,
+            config=config,
+            name=name,
+            caller="jaxreg.register",
+        )
         for cloud, name, place in zip(
             (source, reference), ("source", "reference"), free_space.places(viewpoint), strict=True
         )
@@ -174,20 +182,3 @@ def _check_options(config: RegisterConfig) -> None:
             raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
     if config.refine is not None:
         check_options(config.refine)  # an error for any clouds, also where none is refined
-
-
-def _prepared(
-    cloud: object, name: str, viewpoint: object, nonfinite, strays, config: RegisterConfig
-) -> Prepared:
-    if not isinstance(cloud, Prepared):
-        return prepare.prepare(
-            cloud, viewpoint=viewpoint, nonfinite=nonfinite, strays=strays, config=config, name=name
-        )
-    if viewpoint is not None:
-        raise ValueError(f"{name} is prepared: give its viewpoint to jaxreg.prepare.")
-    if cloud.config != config:
-        raise ValueError(
-            f"{name} was prepared with another configuration than this registration's: give "
-            "jaxreg.prepare and jaxreg.register the same config."
-        )
-    return cloud

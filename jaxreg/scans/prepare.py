@@ -170,6 +170,7 @@ def prepare(
     config = RegisterConfig() if config is None else config
     array, kept = check_points(cloud, name, nonfinite=nonfinite, planar=True)
     across = None if normals is None else check_normals(normals, kept, name)
+    place = free_space.check_place(viewpoint, name)
     far, notes = _strays(array[kept], strays, name)
     if strays == "drop":
         kept[kept] = ~far
@@ -178,7 +179,6 @@ def prepare(
     across = None if across is None else across[kept][first]
     centre, radius = frame.measure(points[~far[first]])
     points = (points - centre) / (radius or 1.0)
-    place = free_space.check_place(viewpoint, name)
     place = None if place is None else (place - centre) / (radius or 1.0)
     k = 10 if config.refine is None else config.refine.k
     fine = reduce_to(points, config.refine_points)
@@ -187,6 +187,36 @@ def prepare(
     return Prepared(
         points, across, centre, radius or 1.0, kept, row, notes, fine, coarse, config, place
     )  # fmt: skip
+
+
+def prepared(
+    cloud: object,
+    *,
+    viewpoint: object,
+    nonfinite: Literal["raise", "drop"],
+    strays: Literal["drop", "keep", "raise"],
+    config: RegisterConfig,
+    name: str,
+    caller: str,
+) -> Prepared:
+    """`prepare`, or the cloud itself if that was done with the same settings for `caller`.
+
+    Raises:
+      ValueError: as `prepare`; or the cloud was prepared with another configuration, or has its
+        viewpoint already.
+    """
+    if not isinstance(cloud, Prepared):
+        return prepare(
+            cloud, viewpoint=viewpoint, nonfinite=nonfinite, strays=strays, config=config, name=name
+        )
+    if viewpoint is not None:
+        raise ValueError(f"{name} is prepared: give its viewpoint to jaxreg.prepare.")
+    if cloud.config != config:
+        raise ValueError(
+            f"{name} was prepared with another configuration than this registration's: give "
+            f"jaxreg.prepare and {caller} the same config."
+        )
+    return cloud
 
 
 def part(cloud: Prepared, rows: Bool[np.ndarray, "n"], config: RegisterConfig) -> Prepared:

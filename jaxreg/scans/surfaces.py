@@ -19,7 +19,6 @@ from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
 from jaxreg.scans import candidates, dense, diagnosis, free_space, prepare, stable, verdict
 from jaxreg.scans.config import RegisterConfig
-from jaxreg.scans.free_space import Sides
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import (
@@ -72,11 +71,11 @@ class Problem(NamedTuple):
         examined = (sides[0].fine.examined, sides[1].fine.examined)
         return candidates.Clouds(source, reference, examined, self.free_space())
 
-    def free_space(self) -> Sides:
+    def free_space(self) -> free_space.Sides:
         """Both clouds as free space sees them."""
         sides = (self.source, self.reference)
         length = float(self.where.length)
-        return Sides(
+        return free_space.Sides(
             (sides[0].view, sides[1].view),
             (sides[0].coarse.points, sides[1].coarse.points),
             (sides[0].radius / length, sides[1].radius / length),
