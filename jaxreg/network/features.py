@@ -3,6 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
@@ -13,6 +14,9 @@ BATCH_AXIS = "batch"
 """Name of the `vmap` axis over which BatchNorm takes its statistics while training."""
 DEVICE_AXIS = "devices"
 """Name of the `shard_map` axis over which it takes them as well, if there is one."""
+
+STATISTICS = "statistics"
+"""Name of the statistics among what a backward pass may keep: devices would sum them up again."""
 
 
 def relative_neighbors(
@@ -60,7 +64,9 @@ class _Normalize(nn.Module):
         )
         statistics = mean.value, var.value
         if train:
-            statistics = _statistics(x, mask)
+            statistics = checkpoint_name(
+                _statistics(x, mask, jnp.asarray(mean.value, x.dtype)), STATISTICS
+            )
             for running, batch in zip((mean, var), statistics, strict=True):
                 batch = batch.astype(running.value.dtype)
                 running.value = self.momentum * running.value + (1 - self.momentum) * batch
@@ -70,29 +76,49 @@ class _Normalize(nn.Module):
         return (x - center) * factor + bias
 
 
-def _statistics(x: Float[Array, "*points c"], mask: Bool[Array, "*#points"]):
-    """Mean and variance of every channel over the valid points of the whole batch."""
+def _statistics(
+    x: Float[Array, "*points c"], mask: Bool[Array, "*#points"], around: Float[Array, "c"]
+) -> tuple[Float[Array, "c"], Float[Array, "c"]]:
+    """Mean and variance of every channel over the valid points of the whole batch.
+
+    `around` is any guess of the mean, the same on all devices.
+    """
     # A sum over points is a product with the mask: XLA:CPU reduces long columns slowly.
     weight = jnp.broadcast_to(mask, x.shape[:-1]).reshape(-1).astype(x.dtype)
     x = x.reshape(-1, x.shape[-1])
 
     def over_batch(values):
-        return _over_all(jnp.matmul(weight, values, precision=Precision.HIGHEST))
+        # Before devices: over both axes at once its derivative would send every cloud's part.
+        return jax.lax.psum(jnp.matmul(weight, values, precision=Precision.HIGHEST), BATCH_AXIS)
 
-    count = jnp.maximum(_over_all(jnp.sum(weight)), 1)
-    mean = over_batch(x) / count
+    count = jax.lax.psum(jnp.sum(weight), BATCH_AXIS)
+    mean = over_batch(x) / jnp.maximum(count, 1)
     # Two passes: E[x^2] - E[x]^2 cancels when the inlier network sees differences near zero.
-    return mean, over_batch((x - mean[None, :]) ** 2) / count
+    squares = over_batch((x - mean[None, :]) ** 2)
+    return _over_devices(count, mean, squares, around)
 
 
-def _over_all(values: Float[Array, "*c"]) -> Float[Array, "*c"]:
-    """The sum over the clouds of all devices."""
-    # One after the other: over both axes at once its derivative would send every cloud's part.
-    values = jax.lax.psum(values, BATCH_AXIS)
+def _over_devices(
+    count: Float[Array, ""],
+    mean: Float[Array, "c"],
+    squares: Float[Array, "c"],
+    around: Float[Array, "c"],
+) -> tuple[Float[Array, "c"], Float[Array, "c"]]:
+    """Mean and variance over all devices from counts, means and squared deviations of each.
+
+    One sum, since what costs is how often something is sent: squares about `around`, which all know
+    beforehand, in place of those about the mean of all, which would take a sum of its own. Only the
+    part that the means of the devices differ by can cancel.
+    """
+    offset = mean - around
+    told = jnp.concatenate([count[None], count * offset, squares, count * offset**2])
     try:
-        return jax.lax.psum(values, DEVICE_AXIS)
+        told = jax.lax.psum(told, DEVICE_AXIS)
     except NameError:  # there is one device
-        return values
+        return mean, squares / jnp.maximum(count, 1)
+    total = jnp.maximum(told[0], 1)
+    offset, within, between = jnp.split(told[1:] / total, 3)
+    return around + offset, within + jnp.maximum(between - offset**2, 0)
 
 
 class DGCNN(nn.Module):

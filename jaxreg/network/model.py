@@ -21,7 +21,7 @@ from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.procrustes import robust_procrustes
 from jaxreg.network import matching_blocks
-from jaxreg.network.features import BATCH_AXIS, DGCNN, relative_neighbors
+from jaxreg.network.features import BATCH_AXIS, DGCNN, STATISTICS, relative_neighbors
 from jaxreg.network.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import (
@@ -271,7 +271,9 @@ def iterate(
     # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
     # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
     # memory. In training `one_at_a_time` recomputes the maps, too.
-    kept = jax.checkpoint_policies.save_only_these_names(_MATCHES, *(() if train else KEPT))
+    kept = jax.checkpoint_policies.save_only_these_names(
+        _MATCHES, *((STATISTICS,) if train else KEPT)
+    )
     step = jax.checkpoint(step, prevent_cse=False, policy=kept)
     (transform, variables), seen = jax.lax.scan(step, start, length=config.iterations)
     return transform, seen, variables

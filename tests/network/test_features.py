@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.network.features import BATCH_AXIS, DGCNN, BatchNorm, relative_neighbors
+from jaxreg.network.features import BATCH_AXIS, DEVICE_AXIS, DGCNN, BatchNorm, relative_neighbors
 from tests import oracles
 from tests.compiled import knn
 
@@ -88,7 +88,8 @@ def test_relative_coordinates_point_from_the_centre_to_the_neighbour(rng):
             np.testing.assert_allclose(result[i, r], points[j] - points[i], atol=1e-15)
 
 
-def test_batch_statistics_run_over_all_valid_points_of_all_clouds(rng):
+@pytest.mark.parametrize("devices", [0, 2])
+def test_batch_statistics_run_over_all_valid_points_of_all_clouds(devices, rng):
     module = BatchNorm(momentum=0.9)
     x, mask = rng.normal(3, 2, (4, 10, 5)), rng.uniform(size=(4, 10)) < 0.7
     padded = np.where(mask[..., None], x, rng.choice([1e6, -1e6, 1e3], (4, 10, 1)))
@@ -97,15 +98,17 @@ def test_batch_statistics_run_over_all_valid_points_of_all_clouds(rng):
         "batch_stats": {"BatchNorm_0": {"mean": np.full(5, 1.0), "var": np.full(5, 3.0)}},
     }
 
-    @jax.jit
-    def run(x, mask):
-        return jax.vmap(
-            lambda x, m: module.apply(variables, x, m, train=True, mutable=["batch_stats"]),
-            axis_name=BATCH_AXIS,
-            out_axes=(0, None),
-        )(x, mask)
-
-    y, updated = run(padded, mask)
+    run = jax.vmap(
+        lambda x, m: module.apply(variables, x, m, train=True, mutable=["batch_stats"]),
+        axis_name=BATCH_AXIS,
+        out_axes=(0, None),
+    )
+    clouds = padded, mask
+    if devices:
+        clouds = tuple(x.reshape(devices, -1, *x.shape[1:]) for x in clouds)
+        run = jax.vmap(run, axis_name=DEVICE_AXIS, out_axes=(0, None))
+    y, updated = jax.jit(run)(*clouds)
+    y = y.reshape(x.shape)
     valid = x[mask]
     mean, var = valid.mean(axis=0), valid.var(axis=0)
     expected = 2 * (valid - mean) / np.sqrt(var + 1e-5) + 0.5
