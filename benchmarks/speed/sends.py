@@ -1,5 +1,6 @@
 """What a training step of many processes sends: read from its compiled program, and timed alone."""
 
+import math
 import re
 from collections.abc import Callable
 
@@ -47,11 +48,28 @@ def _sent(config) -> list[int]:
     with same_streams():
         step = training._train_step_jit.lower(state, shapes, config=config, mesh=mesh)
         text = step.compile().as_text()
-    sent = re.findall(r"= (.*) all-reduce(?:-start)?\(", text)
-    return [
-        sum(int(np.prod([int(n) for n in form.split(",") if n])) for form in forms)
-        for forms in (re.findall(r"f32\[([\d,]*)\]", line) for line in sent)
-    ]
+    return sums_of(text)
+
+
+def sums_of(text: str) -> list[int]:
+    """How many numbers every all-reduce of a compiled program sums up; in a loop, every time."""
+    parts = re.split(r"\n(?=(?:ENTRY )?%)", text)
+    named = {name[1]: part for part in parts if (name := re.match(r"(?:ENTRY )?%([\w.-]+)", part))}
+
+    def of(part: str) -> list[int]:
+        found = []
+        for line in part.splitlines():
+            if sent := re.search(r"= (.*) all-reduce(?:-start)?\(", line):
+                forms = re.findall(r"\w+\[([\d,]*)\]", sent[1])
+                found.append(sum(math.prod(map(int, filter(None, f.split(",")))) for f in forms))
+            elif body := re.search(r" while\(.*body=%([\w.-]+)", line):
+                rounds = re.search(r"known_trip_count\D*(\d+)", line)
+                found += of(named[body[1]]) * (int(rounds[1]) if rounds else 1)
+            elif called := re.search(r" call\(.*to_apply=%([\w.-]+)", line):
+                found += of(named[called[1]])
+        return found
+
+    return of(next(part for part in parts if part.startswith("ENTRY")))
 
 
 def _sums(sizes: list[int]) -> Callable[[int], object]:

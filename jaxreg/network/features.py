@@ -64,9 +64,7 @@ class _Normalize(nn.Module):
         )
         statistics = mean.value, var.value
         if train:
-            statistics = checkpoint_name(
-                _statistics(x, mask, jnp.asarray(mean.value, x.dtype)), STATISTICS
-            )
+            statistics = _statistics(x, mask, jnp.asarray(mean.value, x.dtype))
             for running, batch in zip((mean, var), statistics, strict=True):
                 batch = batch.astype(running.value.dtype)
                 running.value = self.momentum * running.value + (1 - self.momentum) * batch
@@ -113,9 +111,9 @@ def _over_devices(
     offset = mean - around
     told = jnp.concatenate([count[None], count * offset, squares, count * offset**2])
     try:
-        told = jax.lax.psum(told, DEVICE_AXIS)
+        told = checkpoint_name(jax.lax.psum(told, DEVICE_AXIS), STATISTICS)
     except NameError:  # there is one device
-        return mean, squares / jnp.maximum(count, 1)
+        return checkpoint_name((mean, squares / jnp.maximum(count, 1)), STATISTICS)
     total = jnp.maximum(told[0], 1)
     offset, within, between = jnp.split(told[1:] / total, 3)
     return around + offset, within + jnp.maximum(between - offset**2, 0)

@@ -8,7 +8,7 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.types import RigidTransform
@@ -59,20 +59,39 @@ def view(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> Vie
     return View(place, tree, distance, float(np.median(near)), blind)
 
 
-def share_in_front(seen: View, points: Float[np.ndarray, "*k n 3"]) -> Float[np.ndarray, "*k"]:
+class Look(NamedTuple):
+    """Which points lie in directions that were seen.
+
+    `through`: in front of what was measured there; `there`: about as far away. Others lie behind it.
+    """
+
+    seen: Bool[np.ndarray, "*k n"]
+    through: Bool[np.ndarray, "*k n"]
+    there: Bool[np.ndarray, "*k n"]
+
+
+def look(view: View, points: Float[np.ndarray, "*k n 3"]) -> Look:
+    """What a view says of points, in the frame and unit of its cloud."""
+    apart = points - view.place
+    distance = np.linalg.norm(apart, axis=-1)
+    directions = apart / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
+    around = min(_AROUND, len(view.distance))
+    gap, index = view.tree.query(directions, k=list(range(1, around + 1)), workers=-1)
+    measured = view.distance[index]
+    seen = (gap[..., -1] < _GAP * view.step) & (distance > view.blind)
+    through = seen & (distance < (1 - _IN_FRONT) * measured.min(axis=-1))
+    there = seen & ~through & (distance < (1 + _IN_FRONT) * measured.max(axis=-1))
+    return Look(seen, through, there)
+
+
+def share_in_front(view: View, points: Float[np.ndarray, "*k n 3"]) -> Float[np.ndarray, "*k"]:
     """Share of the points, of those in seen directions, that lie in front of what was measured there.
 
     0 where fewer than thirty points lie in seen directions.
     """
-    apart = points - seen.place
-    distance = np.linalg.norm(apart, axis=-1)
-    directions = apart / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
-    around = min(_AROUND, len(seen.distance))
-    gap, index = seen.tree.query(directions, k=list(range(1, around + 1)), workers=-1)
-    looked = (gap[..., -1] < _GAP * seen.step) & (distance > seen.blind)
-    in_front = looked & (distance < (1 - _IN_FRONT) * seen.distance[index].min(axis=-1))
-    count = looked.sum(axis=-1)
-    return np.where(count < _FEWEST, 0.0, in_front.sum(axis=-1) / np.maximum(count, 1))
+    found = look(view, points)
+    count = found.seen.sum(axis=-1)
+    return np.where(count < _FEWEST, 0.0, found.through.sum(axis=-1) / np.maximum(count, 1))
 
 
 class Sides(NamedTuple):

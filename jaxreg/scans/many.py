@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.geometry.clouds import check_pose
-from jaxreg.scans import placing, prepare, proposals, stored
+from jaxreg.scans import apart, placing, prepare, proposals, stored
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.joint import JointRefinement, refine_jointly
 from jaxreg.scans.placing import Placement, Sizes
@@ -182,7 +182,7 @@ def register_many(
     with _runner(prepared, config, work, executor, workers) as runner:
         run = _Run(prepared, names, runner, report, [])
         _find_pairs(run, times, starts)
-        placement = placing.place(run.relations, run.sizes)
+        placement = run.placed()
         steps: tuple[JointRefinement, ...] = ()
         if joint and placement.group.max(initial=-1) >= 0:
             report(len(run.relations), len(run.relations), "joint refinement")
@@ -271,6 +271,19 @@ class _Run(NamedTuple):
                 return
         self.relations.append(relation)
 
+    def placed(self) -> Placement:
+        """Where the pairs so far lay the scans; parts that free space keeps apart are not joined."""
+        refused = np.zeros(len(self.relations), bool)
+        while True:
+            placement = placing.place(self.relations, self.sizes, refused)
+            if all(cloud.viewpoint is None for cloud in self.prepared):
+                return placement
+            seen = apart.looks(self.prepared, placement)
+            torn = apart.kept_apart(self.relations, placement, seen)
+            if not torn.any():
+                return placement
+            refused |= torn
+
     def tried(self) -> dict[tuple[int, int], How]:
         return {(r.reference, r.source): r.how for r in self.relations}
 
@@ -282,16 +295,16 @@ def _find_pairs(run: _Run, times: np.ndarray | None, starts: list[np.ndarray | N
         run.do(_from_starts(run, starts), "registering pairs from their start")
     run.do(_first_pairs(run, likeness, times), "registering pairs")
     for _ in range(_WIDER):
-        placement = placing.place(run.relations, run.sizes)
+        placement = run.placed()
         run.do(_nearby(run, placement), "registering neighbours")
-        placement = placing.place(run.relations, run.sizes)
+        placement = run.placed()
         if (placement.group == 0).all():
             return
         tasks = _wider(run, placement, likeness)
         if not tasks:
             break
         run.do(tasks, "searching more widely")
-    run.do(_nearby(run, placing.place(run.relations, run.sizes)), "registering neighbours")
+    run.do(_nearby(run, run.placed()), "registering neighbours")
 
 
 def _pair(i: int, j: int) -> tuple[int, int]:

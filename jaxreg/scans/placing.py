@@ -80,13 +80,19 @@ class Placement(NamedTuple):
         )
 
 
-def place(relations: list[Relation], sizes: Sizes) -> Placement:
-    """Believe or refuse every pair, and solve for the poses of all scans."""
+def place(
+    relations: list[Relation], sizes: Sizes, apart: Bool[np.ndarray, "e"] | None = None
+) -> Placement:
+    """Believe or refuse every pair, and solve for the poses of all scans.
+
+    Pairs that are `apart` are refused: they join parts that free space keeps apart.
+    """
     count = len(sizes.radius)
     graph, unit = pair_graph(relations, sizes)
     how = np.array([relation.how for relation in relations])
     prior = _at_base_rate(np.array([r.probability for r in relations], np.float64), how)
-    looked_at = prior >= _CONSIDERED
+    apart = np.zeros(len(relations), bool) if apart is None else apart
+    looked_at = (prior >= _CONSIDERED) & ~apart
     graph = graph._replace(mask=looked_at)
     # A pose that other pairs gave closes their triangles, whether these are right or not.
     witnesses = np.flatnonzero(looked_at & (how != "start"))
@@ -123,7 +129,7 @@ def place(relations: list[Relation], sizes: Sizes) -> Placement:
         _about_centres(covariance, solved.poses, unit),
         posterior,
         used,
-        tuple(_refusals(relations, used, agrees, refuted, posterior)),
+        tuple(_refusals(relations, used, apart, agrees, refuted, posterior)),
         _parts(graph, used & (prior >= SURE), count),
     )
 
@@ -425,12 +431,14 @@ def _chances(graph: PoseGraph, used, posterior, group, first) -> Float[np.ndarra
     return np.where(group < 0, 0.0, np.exp(-length))
 
 
-def _refusals(relations, used, agrees, refuted, posterior):
+def _refusals(relations, used, apart, agrees, refuted, posterior):
     for k, relation in enumerate(relations):
         if used[k]:
             yield ""
         elif not relation.success:
             yield relation.reason
+        elif apart[k]:
+            yield "Where it lays them, scans on one side fill what those on the other saw to be empty."
         elif not agrees[k]:
             yield "It contradicts pairs that agree among each other."
         elif refuted[k]:

@@ -1,9 +1,13 @@
 """What speed and scaling write: rows of the candidates, ratios, exponents, one file a part."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from benchmarks.paper import accuracy
-from benchmarks.speed import candidates, many_pairs, parallel, scaling, speed, stages
+from benchmarks.speed import candidates, many_pairs, parallel, scaling, sends, speed, stages
 from benchmarks.speed import records as of_speed
 
 OPTIONS = speed.Options(points=(768, 1434), batch=8)
@@ -149,3 +153,26 @@ def test_steps_are_counted_over_the_same_time(tmp_path):
     assert parallel.steps(log) == 0
     log.write_text("{}\n{}\n{")
     assert parallel.steps(log) == 2
+
+
+def test_sums_in_a_loop_count_every_time():
+    """Two emulated devices: a sum of 5 and of 2 x 3 numbers, then three rounds with one of 4."""
+    program = """
+import jax, jax.numpy as jnp
+from jax.sharding import PartitionSpec
+mesh = jax.make_mesh((2,), ("d",), axis_types=(jax.sharding.AxisType.Auto,))
+def local(x, y, z):
+    sums = jax.lax.psum(x, "d"), jax.lax.psum(y * x[0], "d")
+    return *sums, jax.lax.fori_loop(0, 3, lambda i, z: jnp.sin(jax.lax.psum(z, "d")), z)
+spec = PartitionSpec("d")
+step = jax.shard_map(local, mesh=mesh, in_specs=(spec,) * 3, out_specs=spec, check_vma=False)
+clouds = [jnp.ones((2 * n, m)) for n, m in ((5, 1), (2, 3), (4, 1))]
+print(jax.jit(step).lower(*clouds).compile().as_text())
+"""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    text = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    ).stdout
+    found = sends.sums_of(text)
+    assert sum(found) == 5 + 6 + 3 * 4
+    assert len(found) in (4, 5)  # XLA may send the first two as one
