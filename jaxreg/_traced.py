@@ -13,6 +13,7 @@ import pickle
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from concurrent import futures
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,19 +24,35 @@ from jax.core import Tracer
 _lock = threading.RLock()  # a program that is traced may call another
 _folder: Path | None = None
 _programs: dict[Any, Callable[..., Any]] = {}
+_ahead: dict[Path, futures.Future] = {}
+_used: dict[Path, None] = {}  # in this order
 
 
 @contextlib.contextmanager
 def kept_in(folder: Path) -> Iterator[None]:
     """Keep programs in `folder` during the block; others must not be able to write there.
 
-    What the files hold is run, as with XLA's cache.
+    What the files hold is run, as with XLA's cache. The programs that the last block used are loaded
+    by another thread, while this one imports and reads.
     """
     global _folder
     before, _folder = _folder, folder / _version()
+    used = _folder.with_suffix(".used")
     try:
-        yield
+        with futures.ThreadPoolExecutor(1) as loader:
+            with contextlib.suppress(OSError):
+                for name in used.read_text("utf-8").split():
+                    _ahead[_folder / name] = loader.submit(_loaded, _folder / name)
+            try:
+                yield
+            finally:
+                loader.shutdown(cancel_futures=True)
+        with contextlib.suppress(OSError):
+            if names := [path.name for path in _used if path.parent == _folder]:
+                _write(used, "\n".join(names).encode())
     finally:
+        _ahead.clear()
+        _used.clear()
         _folder = before
 
 
@@ -88,19 +105,30 @@ def _closes_over(function: Callable[..., Any]) -> bool:
 def _program(call: _Call, folder: Path) -> Callable[..., Any]:
     """The kept program of a call; made and kept if there is none, and the function if that fails."""
     path = folder / call.name()
+    _used[path] = None
     try:
-        from jax import export
-
         try:
-            written, outputs = pickle.loads(path.read_bytes())
+            ahead = _ahead.get(path)
+            run, outputs = _loaded(path) if ahead is None else ahead.result()
         except Exception:  # noqa: BLE001 - not there, or of a process that was killed
-            written, outputs = _exported(call)
-            _write(path, pickle.dumps((written, outputs)))
-        run = jax.jit(export.deserialize(bytearray(written)).call, compiler_options=_quick())
+            _write(path, pickle.dumps(_exported(call)))
+            run, outputs = _loaded(path)
     except Exception:  # noqa: BLE001 - no flatbuffers, no space, an operation that cannot be exported
         return call.function
     result = jax.tree.structure(outputs)
     return lambda *arguments, **_: jax.tree.unflatten(result, run(*jax.tree.leaves(arguments)))
+
+
+def _loaded(path: Path) -> tuple[Callable[..., Any], Any]:
+    """A kept program, compiled, and a tree of what it returns."""
+    from jax import export
+
+    written, outputs = pickle.loads(path.read_bytes())
+    exported = export.deserialize(bytearray(written))
+    forms = [
+        jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in exported.in_avals
+    ]
+    return jax.jit(exported.call, compiler_options=_quick()).lower(*forms).compile(), outputs
 
 
 @functools.cache

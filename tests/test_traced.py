@@ -64,6 +64,23 @@ def test_the_next_process_traces_nothing_and_finds_the_same(tmp_path, another_pr
         assert counted.traced == traces
 
 
+def test_what_the_last_one_used_is_loaded_ahead(tmp_path, another_process):
+    for ahead in (0, 2, 1):
+        another_process()
+        counted = Counted()
+        function = counted.jitted()
+        with _traced.kept_in(tmp_path):
+            loading = dict(_traced._ahead)
+            assert len(loading) == ahead
+            same(function(PAIR, 2.0, power=2))
+            assert all(future.exception(timeout=60) is None for future in loading.values())
+            if ahead == 0:
+                same(function(PAIR, 2.0, power=3), power=3)
+            else:
+                assert counted.traced == 0
+        assert not _traced._ahead
+
+
 def test_another_call_has_another_program(tmp_path, another_process):
     counted = Counted()
     function = counted.jitted()

@@ -95,16 +95,16 @@ class Register:
 
     def run(self) -> int:
         """Register, write, print; returns the exit status."""
-        from jaxreg import io
-
         _check_outputs(self)
-        initial = io.read_matrix(self.initial) if self.initial else None
-        scans = [checked_scan(path, self.nonfinite) for path in (self.source, self.reference)]
-        source, reference = (scan.points for scan in scans)
-        begin = time.perf_counter()
         with patience():
+            from jaxreg import io
+
+            initial = io.read_matrix(self.initial) if self.initial else None
+            scans = [checked_scan(path, self.nonfinite) for path in (self.source, self.reference)]
+            begin = time.perf_counter()
             result = _registered(self, scans, initial)
-        seconds = time.perf_counter() - begin
+            seconds = time.perf_counter() - begin
+        source, reference = (scan.points for scan in scans)
         lost: list[str] = []
         try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
             _write_results(self, source, reference, result, lost)
