@@ -310,7 +310,8 @@ class Config:
     rpmnet: RPMNetConfig = RPMNetConfig()
     fmr: FMRConfig = FMRConfig()
     weights: str = ""
-    """Released weights that `jaxreg evaluate` uses when no checkpoint is given."""
+    """Released weights that `jaxreg evaluate` uses when no checkpoint is given; those that training
+    starts from are named on its command line."""
 
 
 PEERS = ("dcp", "cemnet", "idam", "rpmnet", "fmr")

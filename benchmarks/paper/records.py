@@ -1,5 +1,6 @@
 """The records of the paper's tables, from the cells that `benchmarks.paper.tables` has made."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,37 @@ FIGURES = {
 """Columns of the records, the figures that fill them, and their heads."""
 
 
+def _with_kept(
+    name: str, rows: dict[str, dict], setting: dict
+) -> tuple[dict[str, dict], dict, str | None]:
+    """Rows and setting of a record, and what this run did not measure from the record as it stands.
+
+    RIENet's weights, or hours, are not at hand in every run. Also a note that names the commit of
+    what was kept.
+    """
+    path = record.FOLDER / f"{name}.json"
+    if not path.is_file():
+        return rows, setting, None
+    old = json.loads(path.read_text("utf-8"))
+    kept = sorted(
+        key
+        for key in old["rows"]
+        if any(
+            value is not None and rows.get(key, {}).get(figure) is None
+            for figure, value in old["rows"][key].items()
+        )
+    )
+    merged = {
+        key: old["rows"].get(key, {})
+        | {figure: value for figure, value in rows.get(key, {}).items() if value is not None}
+        for key in dict.fromkeys([*rows, *old["rows"]])
+    }
+    if not kept:
+        return merged, setting, None
+    note = f"Not made in this run, but at commit {old['commit']}: figures of {', '.join(kept)}."
+    return merged, old["setting"] | setting, " ".join(filter(None, [note, old.get("note")]))
+
+
 def write_paper(cells: Cells, root: Path | None) -> Path:
     """The record `paper`: a row a set of pairs, with what the network makes of it in three ways."""
     kinds = dict(zip(("network", "robust", "refined"), NETWORK, strict=True))
@@ -48,13 +80,15 @@ def write_paper(cells: Cells, root: Path | None) -> Path:
             for key, (figure, _) in FIGURES.items()
         }
     heads = {f"{kind}_{key}": f"{kind}: {x[1]}" for kind in kinds for key, x in FIGURES.items()}
+    table, told, note = _with_kept("paper", table, setting(root))
     return record.write(
         "paper",
         question="Is the paper's accuracy reached?",
         command=record.command("benchmarks.paper.tables"),
         columns={"pairs": "pairs", "paper": "paper's MAE(R)"} | heads,
         rows=table,
-        setting=setting(root),
+        setting=told,
+        note=note,
     )
 
 
@@ -132,6 +166,7 @@ def write_others(cells: Cells, some_pairs: int) -> Path:
         found["failed"] = round((1 - best["recall_1deg"]) * best["pairs"])
     if own := clean.get("jaxreg"):
         found["all_pairs"] = own["pairs"]
+    table, found, note = _with_kept("other_methods", table, found)
     return record.write(
         "other_methods",
         question="What do other methods reach on the same pairs?",
@@ -144,4 +179,5 @@ def write_others(cells: Cells, some_pairs: int) -> Path:
         },
         rows=table,
         setting=found,
+        note=note,
     )

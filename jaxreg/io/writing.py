@@ -31,12 +31,16 @@ def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
     LAS and LAZ leave out rows that are not finite; all other formats keep them.
 
     Raises:
-      ValueError: the suffix is not writable, the folder does not exist, or LAS gets no finite row.
+      ValueError: the points are not (n, 3), the suffix is not writable, the folder does not exist,
+        or LAS gets no finite row.
       ImportError: a LAS or LAZ file, and laspy is not installed.
     """
     path = Path(path)
     check_writable(path)
-    WRITERS[path.suffix.lower()](path, np.asarray(points, np.float64))
+    array = np.asarray(points, np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {array.shape}.")
+    WRITERS[path.suffix.lower()](path, array)
 
 
 def check_writable(path: Path) -> None:

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from jaxreg.geometry import arguments
 from jaxreg.geometry.clouds import check_pose
 from jaxreg.refine.config import check_options
 from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
@@ -175,6 +176,7 @@ _LEAST = {"search_points": 16, "refine_points": 16}
 
 
 def _check_options(config: RegisterConfig) -> None:
+    arguments.settings("config", config, RegisterConfig)
     for name in ("search_points", "refine_points", "inlier_spacings", "refine_spacings"):
         value, least = getattr(config, name), _LEAST.get(name, 0)
         if not (least <= value < np.inf and value > 0):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg._xla import from_host
-from jaxreg.geometry import frame
+from jaxreg.geometry import arguments, frame
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
@@ -168,6 +168,7 @@ def prepare(
         and `strays` is "raise".
     """
     config = RegisterConfig() if config is None else config
+    arguments.settings("config", config, RegisterConfig)
     array, kept = check_points(cloud, name, nonfinite=nonfinite, planar=True)
     across = None if normals is None else check_normals(normals, kept, name)
     place = free_space.check_place(viewpoint, name)

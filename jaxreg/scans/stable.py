@@ -74,7 +74,8 @@ def settled(
     noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
-    around = np.asarray(cKDTree(second).query(second, k=min(_AROUND, len(second)), workers=-1)[1])
+    around = list(range(1, min(_AROUND, len(second)) + 1))  # a list gives a column each, also one
+    around = np.asarray(cKDTree(second).query(second, k=around, workers=-1)[1])
     at = {"motions": motions, "count": _NEIGHBORS}
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]

@@ -99,9 +99,10 @@ def check_new_name(name: str, directory: str | Path) -> None:
         raise ValueError(f"weights cannot be called {name!r}: use letters, digits, _ and - only.")
     for folder in (Path(directory), _SHIPPED):
         if (folder / f"{name}.npz").exists():
+            mend = f", or delete {name}.npz and {name}.json in {folder} to replace them"
             raise ValueError(
-                f"weights '{name}' already exist: choose another name, or delete {name}.npz and "
-                f"{name}.json in {folder} to replace them."
+                f"weights '{name}' already exist: choose another name"
+                f"{mend if folder != _SHIPPED else ', for these come with jaxreg'}."
             )
 
 

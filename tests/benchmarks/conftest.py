@@ -15,6 +15,7 @@ def records(tmp_path, monkeypatch):
     """`read(name)` is a record that was written; `fits(*names)` puts these into RESULTS.md."""
     folder = tmp_path / "results"
     folder.mkdir()
+    monkeypatch.setattr(record, "FOLDER", folder)
     monkeypatch.setattr(record, "write", functools.partial(record.write, folder=folder))
     monkeypatch.setattr(sys, "argv", ["benchmark", "--data-root", "/data", "--pairs", "2"])
 

@@ -16,6 +16,7 @@ from jaxreg.refine.config import RefineConfig
 from jaxreg.scans import prepare
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
+from jaxreg.search.config import SearchConfig
 from jaxreg.types import RigidTransform
 from tests.scenes import angle_deg, assert_proper, moved, pose, revolved, shape
 
@@ -483,7 +484,9 @@ def test_a_wrong_pose_says_why_and_names_the_others(pair):
     assert not unlike.success
     assert unlike.reason.endswith(".")
     flat = np.c_[np.random.default_rng(0).uniform(size=(400, 2)), np.zeros(400)]
-    assert "leave the pose free: " in register(flat, flat + 0.001).reason
+    found = register(flat, flat + 0.001)
+    assert not found.success
+    assert found.reason.endswith(".")
     assert register(*pair[:2]).reason == ""
     box = np.random.default_rng(1).uniform(-1, 1, size=(2, 600, 3)) * [1.0, 0.6, 0.4]
     side = np.random.default_rng(2).integers(0, 3, size=(2, 600))
@@ -499,3 +502,19 @@ def test_a_wrong_pose_says_why_and_names_the_others(pair):
     assert sum(chances) > 0.5  # three of the four poses that agree equally well
     assert found.probability + sum(chances) <= 1 + 1e-9
     assert not found.success
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize("config", [SearchConfig(), {}])
+def test_settings_of_another_kind_are_named(config, rng):
+    cloud = rng.normal(size=(100, 3))
+    for call in (prepare.prepare, lambda x, config: register(x, x, config=config)):
+        with pytest.raises(ValueError, match="config must be a jaxreg.RegisterConfig"):
+            call(cloud, config=config)
+
+
+@pytest.mark.parametrize("count", [50, 500])
+def test_points_in_one_place_are_no_success(count, rng):
+    cloud = rng.normal(size=(400, 3))
+    assert not register(np.zeros((count, 3)), cloud).success
+    assert not register(cloud, np.ones((count, 3))).success
