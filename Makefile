@@ -11,7 +11,7 @@ export JAX_PLATFORMS ?= cpu
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
 
-demo: $(VENV)/.installed  ## train on procedural shapes, evaluate, draw a pair (8 minutes, 2 cores)
+demo: $(VENV)/.installed  ## train on procedural shapes, evaluate, draw a pair (4 minutes, 2 cores)
 	$(BIN)/python train.py configs/synthetic_cpu.toml --workdir runs/demo
 	$(BIN)/python evaluate.py configs/synthetic_cpu.toml --checkpoint runs/demo --picture runs/demo/pair.png
 

@@ -38,8 +38,8 @@ def _with_kept(
 ) -> tuple[dict[str, dict], dict, str | None]:
     """Rows and setting of a record, and what this run did not measure from the record as it stands.
 
-    RIENet's weights, or hours, are not at hand in every run. Also a note that names the commit of
-    what was kept.
+    RIENet's weights, or hours, are not at hand in every run. Times compare within one run only: they
+    stay as they are unless all rows were made. Also a note that names the commit of what was kept.
     """
     path = record.FOLDER / f"{name}.json"
     if not path.is_file():
@@ -55,7 +55,11 @@ def _with_kept(
     )
     merged = {
         key: old["rows"].get(key, {})
-        | {figure: value for figure, value in rows.get(key, {}).items() if value is not None}
+        | {
+            figure: value
+            for figure, value in rows.get(key, {}).items()
+            if value is not None and not (kept and figure.endswith("_ms"))
+        }
         for key in dict.fromkeys([*rows, *old["rows"]])
     }
     if not kept:
