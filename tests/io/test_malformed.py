@@ -173,6 +173,7 @@ def test_unwritable(tmp_path):
         io.write_cloud(tmp_path / "nowhere" / "a.ply", np.zeros((3, 3)))
 
 
+@pytest.mark.untyped
 @pytest.mark.parametrize("suffix", [".ply", ".xyz", ".npz", ".pcd"])
 def test_points_of_two_coordinates_are_not_written(suffix, tmp_path):
     with pytest.raises(ValueError, match=r"points must have shape \(n, 3\), got \(4, 2\)"):
