@@ -72,6 +72,12 @@ def write(
     return path
 
 
+def read(name: str) -> dict | None:
+    """NAME.json as it stands; None if there is none."""
+    path = FOLDER / f"{name}.json"
+    return json.loads(path.read_text("utf-8")) if path.is_file() else None
+
+
 def command(module: str) -> str:
     """The command line of this process as one that makes the record again, elsewhere.
 

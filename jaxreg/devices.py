@@ -45,8 +45,7 @@ def join_processes(
     missing = [option for option, value in known.items() if value is None]
     if len(missing) == len(known):
         if int(os.environ.get("SLURM_NTASKS", "1")) > 1:
-            _let_holders_of_locks_run()
-            jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_SECONDS)
+            _initialize()
         return
     if missing:
         raise ValueError(
@@ -54,10 +53,15 @@ def join_processes(
             f"and --process-id K, or set {', '.join(_VARIABLES)}."
         )
     address, count, rank = map(str, known.values())
+    _initialize(address, int(count), int(rank))
+
+
+def _initialize(
+    address: str | None = None, count: int | None = None, rank: int | None = None
+) -> None:
+    """`jax.distributed.initialize`, which finds what is None."""
     _let_holders_of_locks_run()
-    jax.distributed.initialize(
-        address, int(count), int(rank), heartbeat_timeout_seconds=_HEARTBEAT_SECONDS
-    )
+    jax.distributed.initialize(address, count, rank, heartbeat_timeout_seconds=_HEARTBEAT_SECONDS)
 
 
 def _let_holders_of_locks_run() -> None:
@@ -65,7 +69,7 @@ def _let_holders_of_locks_run() -> None:
 
     Gloo's thread that receives wakes up for every message, and then polls until it gets the lock of its
     connection. On a core that it shares with the holder it would keep that from giving the lock back
-    until its time slice ends, some 4 ms in each of the seventy sums of a training step.
+    until its time slice ends, some 4 ms in each sum of a training step.
     """
     if hasattr(os, "SCHED_BATCH") and os.sched_getscheduler(0) == os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -1,6 +1,5 @@
 """The records of the paper's tables, from the cells that `benchmarks.paper.tables` has made."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +40,9 @@ def _with_kept(
     RIENet's weights, or hours, are not at hand in every run. Times compare within one run only: they
     stay as they are unless all rows were made. Also a note that names the commit of what was kept.
     """
-    path = record.FOLDER / f"{name}.json"
-    if not path.is_file():
+    old = record.read(name)
+    if old is None:
         return rows, setting, None
-    old = json.loads(path.read_text("utf-8"))
     kept = sorted(
         key
         for key in old["rows"]

@@ -262,8 +262,7 @@ class Options:
 
 def write(rows: dict[str, dict]) -> None:
     """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as they are."""
-    path = record.FOLDER / "sequences.json"
-    kept = json.loads(path.read_text("utf-8"))["rows"] if path.is_file() else {}
+    kept = (record.read("sequences") or {"rows": {}})["rows"]
     for name in VOXEL:
         if name in kept or name in rows:
             kept[name] = kept.get(name, {}) | rows.get(name, {})

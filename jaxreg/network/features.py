@@ -16,7 +16,7 @@ DEVICE_AXIS = "devices"
 """Name of the `shard_map` axis over which it takes them as well, if there is one."""
 
 STATISTICS = "statistics"
-"""Name of the statistics among what a backward pass may keep: devices would sum them up again."""
+"""Name of BatchNorm's statistics among the values that a backward pass may keep (`checkpoint_name`)."""
 
 
 def relative_neighbors(

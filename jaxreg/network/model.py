@@ -270,7 +270,8 @@ def iterate(
     start = (jax.tree.map(lambda x: varying_like(x, source.points[0, 0]), start), variables)
     # A step is recomputed in the backward pass, except its matches and the two maps that cost most:
     # cheaper than writing and reading a dozen (n, m) arrays per step, with less than half of the
-    # memory. In training `one_at_a_time` recomputes the maps, too.
+    # memory. In training `one_at_a_time` recomputes the maps, too, and the statistics of BatchNorm are
+    # kept: many devices would have to sum them up again.
     kept = jax.checkpoint_policies.save_only_these_names(
         _MATCHES, *((STATISTICS,) if train else KEPT)
     )

@@ -74,8 +74,9 @@ def settled(
     noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
-    around = list(range(1, min(_AROUND, len(second)) + 1))  # a list gives a column each, also one
-    around = np.asarray(cKDTree(second).query(second, k=around, workers=-1)[1])
+    # As a list, or of one rank there would be no column.
+    ranks = list(range(1, min(_AROUND, len(second)) + 1))
+    around = np.asarray(cKDTree(second).query(second, k=ranks, workers=-1)[1])
     at = {"motions": motions, "count": _NEIGHBORS}
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]
