@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.transform import Rotation
 
 from jaxreg._xla import from_host
+from jaxreg.geometry import trees
 from jaxreg.geometry.clouds import padded_size
 from jaxreg.geometry.normals import edge_normals, normals, surface_covariances
 from jaxreg.refine.config import RefineConfig
@@ -78,10 +79,8 @@ class IndexedCloud(NamedTuple):
         index is any. Most of the time of a query goes into points that lie far off.
         """
         bound = within / self.scale
-        distance, index = self.tree.query(
-            queries / self.scale, distance_upper_bound=bound, workers=-1
-        )
-        return np.asarray(distance) * self.scale, np.minimum(index, len(self.points) - 1)
+        distance, index = trees.nearest(self.tree, queries / self.scale, within=bound)
+        return distance * self.scale, np.minimum(index, len(self.points) - 1)
 
 
 def index_cloud(
@@ -91,7 +90,7 @@ def index_cloud(
     tree = cKDTree(points)
     found = min(k, len(points) - 1) + 1
     # One more than asked for: the point finds itself, and a row of its own index does not count.
-    _, index = tree.query(points, k=list(range(1, found + 1)), workers=-1)
+    _, index = trees.neighbors(tree, points, found)
     size = _padded_size(len(points))
     rows = np.broadcast_to(np.arange(size, dtype=np.int32)[:, None], (size, k + 1)).copy()
     rows[: len(points), :found] = index

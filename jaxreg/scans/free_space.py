@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.geometry import trees
 from jaxreg.types import RigidTransform
 
 _DIRECTIONS = 20_000
@@ -54,7 +55,7 @@ def view(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> Vie
     distance = np.linalg.norm(seen, axis=1)
     seen, distance = seen[distance > 0], distance[distance > 0]
     tree = cKDTree(seen / distance[:, None])
-    near = tree.query(tree.data[::5], k=min(_AROUND, len(seen) - 1) + 1, workers=-1)[0][:, -1]
+    near = trees.neighbors(tree, tree.data[::5], min(_AROUND, len(seen) - 1) + 1)[0][:, -1]
     blind = _BLIND * float(np.quantile(distance, _NEAREST))
     return View(place, tree, distance, float(np.median(near)), blind)
 
@@ -76,7 +77,7 @@ def look(view: View, points: Float[np.ndarray, "*k n 3"]) -> Look:
     distance = np.linalg.norm(apart, axis=-1)
     directions = apart / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
     around = min(_AROUND, len(view.distance))
-    gap, index = view.tree.query(directions, k=list(range(1, around + 1)), workers=-1)
+    gap, index = trees.neighbors(view.tree, directions, around)
     measured = view.distance[index]
     seen = (gap[..., -1] < _GAP * view.step) & (distance > view.blind)
     through = seen & (distance < (1 - _IN_FRONT) * measured.min(axis=-1))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxreg.geometry import se3
+from jaxreg.geometry import se3, trees
 from jaxreg.graph.pose_graph import EdgeEquations, PoseGraph, retract
 from jaxreg.graph.sparse import gauss_newton_steps
 from jaxreg.refine.kdtree import IndexedCloud
@@ -138,9 +138,7 @@ def _one_way(moving, still, moving_scale, still_scale, pose: RigidTransform, wit
     stride = _stride(moving)
     x = moving.points[::stride] * moving_scale
     moved = x @ pose.rotation.T + pose.translation
-    distance, index = still.tree.query(
-        moved / still_scale, distance_upper_bound=within / still_scale, workers=-1
-    )
+    distance, index = trees.nearest(still.tree, moved / still_scale, within=within / still_scale)
     near = np.isfinite(distance)
     x, moved, index = x[near], moved[near], index[near]
     residual = moved - still.points[index] * still_scale
@@ -209,9 +207,7 @@ def _off(moving, still, moving_scale, still_scale, pose, reach) -> np.ndarray:
     stride = _stride(moving)
     others = moving.points[stride // 2 :: stride] * moving_scale
     moved = others @ pose.rotation.T + pose.translation
-    distance, index = still.tree.query(
-        moved / still_scale, distance_upper_bound=reach / still_scale, workers=-1
-    )
+    distance, index = trees.nearest(still.tree, moved / still_scale, within=reach / still_scale)
     near = np.isfinite(distance)
     residual = moved[near] - still.points[index[near]] * still_scale
     off = np.full(len(moved), reach / 2)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import clouds as checks
+from jaxreg.geometry import trees
 from jaxreg.judge.evidence import REACH, Evidence
 from jaxreg.judge.odds import chances as chances_of
 from jaxreg.judge.surface import Examined
@@ -153,13 +154,13 @@ def _line(cloud: Prepared) -> Line:
 def _examined(points: Float[np.ndarray, "j 3"], tree: cKDTree, cloud: Prepared) -> Examined:
     """A line as the judge sees a surface: padded, with normals, corners, rare directions and ends."""
     count = min(_NEIGHBORS, len(points) - 1)
-    distance, index = tree.query(points, k=count + 1)
+    distance, index = trees.neighbors(tree, points, count + 1)
     spread = points[index] - points[index].mean(axis=1, keepdims=True)
     moment = np.einsum("nki,nkj->nij", spread, spread)[:, :2, :2]
     variance, axes = np.linalg.eigh(moment)
     normals = np.concatenate([axes[:, :, 0], np.zeros((len(points), 1))], axis=1)
     if cloud.normals is not None:
-        normals = cloud.normals[np.asarray(cloud.tree.query(points)[1])]
+        normals = cloud.normals[trees.nearest(cloud.tree, points)[1]]
     alike = np.mean(np.abs(normals @ normals.T) > _ALIKE, axis=1)
     aside = np.linalg.norm(points[index[:, 1:]].mean(axis=1) - points, axis=1)
     size = checks.padded_size(len(points), smallest=512)
@@ -233,8 +234,8 @@ def _judged(
     reach = 1.0001 * REACH * max(float(line.examined.spacing) * scale for line, scale in sides)
     moved = ratio * x.judged @ np.swapaxes(poses.rotation, 1, 2) + poses.translation[:, None]
     back = (y.judged - poses.translation[:, None]) @ poses.rotation / ratio
-    off, there = y.judged_tree.query(moved, distance_upper_bound=reach)
-    here = x.judged_tree.query(back, distance_upper_bound=reach / ratio)[1]
+    off, there = trees.nearest(y.judged_tree, moved, within=reach)
+    here = trees.nearest(x.judged_tree, back, within=reach / ratio)[1]
     evidence = candidates.read(
         poses, (x.examined, y.examined), (ratio, 1.0),
         np.minimum(there, len(y.judged) - 1), np.minimum(here, len(x.judged) - 1),
@@ -285,7 +286,10 @@ def _weak(fit: planes.Fitted) -> tuple[WeakDirection, ...]:
 def _overlap(x: Line, y: Line, ratio: float, pose: RigidTransform, within: float) -> float:
     moved = ratio * x.judged @ pose.rotation.T + pose.translation
     back = (y.judged - pose.translation) @ pose.rotation / ratio
-    there, here = y.judged_tree.query(moved)[0], ratio * x.judged_tree.query(back)[0]
+    there, here = (
+        trees.nearest(y.judged_tree, moved)[0],
+        ratio * trees.nearest(x.judged_tree, back)[0],
+    )
     return float(np.mean(np.concatenate([there, here]) < within))
 
 

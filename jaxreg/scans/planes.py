@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.geometry import trees
 from jaxreg.types import RigidTransform
 
 NEIGHBORS = 12
@@ -72,8 +73,7 @@ def patches(
 ) -> Patches:
     """The patches next to points; `flat`: of lines in the plane z = 0."""
     count = min(count, len(points))
-    index = np.asarray(tree.query(at, k=list(range(1, count + 1)), workers=-1)[1])
-    found = points[index]
+    found = points[trees.neighbors(tree, at, count)[1]]
     centre = found.mean(axis=1)
     spread = found - centre[:, None]
     moment = np.einsum("nki,nkj->nij", spread, spread) / count

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg._xla import from_host
-from jaxreg.geometry import arguments, frame
+from jaxreg.geometry import arguments, frame, trees
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
@@ -293,14 +293,6 @@ def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, 
     return _means(points, chosen)
 
 
-def nearest(
-    tree: cKDTree, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Distance to, and index of, the nearest point of the tree, on all cores."""
-    distance, index = tree.query(points, workers=-1)
-    return np.asarray(distance), np.asarray(index)
-
-
 def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> float:
     """How far apart neighbouring points of the surface are: the median distance to the 4th nearest.
 
@@ -310,7 +302,7 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
     if k < 1:
         return 0.0
     found = cKDTree(points) if tree is None else tree
-    return float(np.median(found.query(points, k=k + 1, workers=-1)[0][:, -1]))
+    return float(np.median(trees.neighbors(found, points, k + 1)[0][:, -1]))
 
 
 _examine = from_host(jax.jit(examine))
@@ -342,7 +334,7 @@ def _strays(
 
 def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k: int) -> Level:
     if normals is not None:
-        normals = normals[nearest(cKDTree(whole), points)[1]]
+        normals = normals[trees.nearest(cKDTree(whole), points)[1]]
     return Level(points, normals, k)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.geometry import trees
 from jaxreg.scans.prepare import Prepared, in_steps
 
 _SIZE = 1024
@@ -78,7 +79,7 @@ def overlaps(
         cloud = prepared[k]
         points = cloud.coarse.points * cloud.radius + cloud.centre
         clouds[k] = points @ matrix[:3, :3].T + matrix[:3, 3]
-    trees = {k: cKDTree(points) for k, points in clouds.items()}
+    tree_of = {k: cKDTree(points) for k, points in clouds.items()}
     middles = {k: points.mean(axis=0) for k, points in clouds.items()}
     extents = {k: np.linalg.norm(p - middles[k], axis=1).max() for k, p in clouds.items()}
     found = {}
@@ -88,12 +89,12 @@ def overlaps(
                 continue
             reach = 1.5 * max(prepared[k].coarse.spacing * prepared[k].radius for k in (i, j))
             found[i, j] = min(
-                _share(clouds[i], trees[j], reach), _share(clouds[j], trees[i], reach)
+                _share(clouds[i], tree_of[j], reach), _share(clouds[j], tree_of[i], reach)
             )
     return found
 
 
 def _share(points: np.ndarray, tree: cKDTree, reach: float) -> float:
     rows = np.linspace(0, len(points) - 1, min(_SHOWN, len(points))).astype(int)
-    distance, _ = tree.query(points[rows], distance_upper_bound=reach, workers=-1)
+    distance, _ = trees.nearest(tree, points[rows], within=reach)
     return float(np.isfinite(distance).mean())

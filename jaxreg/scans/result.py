@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.geometry import trees
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
-from jaxreg.scans.prepare import Prepared, nearest
+from jaxreg.scans.prepare import Prepared
 from jaxreg.types import RigidTransform
 
 LISTED = 0.01
@@ -133,7 +134,7 @@ def assembled(
     """
     source, reference = clouds
     moved = (source.points * source.radius) @ pose.rotation.T + pose.translation
-    near, index = nearest(reference.tree, moved / reference.radius)
+    near, index = trees.nearest(reference.tree, moved / reference.radius)
     near = near * reference.radius
     inside = near <= distance
     out = out_of(clouds, pose)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.geometry import trees
 from jaxreg.scans import planes
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
@@ -74,9 +75,7 @@ def settled(
     noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
-    # As a list, or of one rank there would be no column.
-    ranks = list(range(1, min(_AROUND, len(second)) + 1))
-    around = np.asarray(cKDTree(second).query(second, k=ranks, workers=-1)[1])
+    around = trees.neighbors(cKDTree(second), second, min(_AROUND, len(second)))[1]
     at = {"motions": motions, "count": _NEIGHBORS}
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
+from jaxreg.geometry import trees
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.scans.known import best_turn, turns_about
 from jaxreg.types import RigidTransform
@@ -239,7 +240,7 @@ def _with_most_pairs(problem: _Problem, poses: RigidTransform, reach: float) -> 
         if len(chosen) > most:
             moved = np.einsum("bij,nj->bni", poses.rotation[chosen], some)
             moved += poses.translation[chosen][:, None]
-            near = np.minimum(tree.query(moved, distance_upper_bound=reach)[0] / reach, 1)
+            near = np.minimum(trees.nearest(tree, moved, within=reach)[0] / reach, 1)
             score = np.sum(1 - near**2, axis=1)
             chosen = chosen[np.argsort(-score, kind="stable")[:most]]
     return chosen.tolist()

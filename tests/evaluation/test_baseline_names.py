@@ -20,7 +20,7 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch, name, module):
 
 
 def test_a_spacing_is_given_with_the_name():
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", reason="the baselines are not installed", exc_type=ImportError)
     chosen = choose("open3d_fgr@0.02")
     plain = choose("open3d_fgr")
     assert chosen.func is plain.func

@@ -38,7 +38,7 @@ def test_objects_are_read_by_their_own_points():
 
 
 def test_open3d():
-    o3d = pytest.importorskip("open3d", reason="the extra `baselines` is not installed")
+    o3d = pytest.importorskip("open3d", reason="Open3D is not here", exc_type=ImportError)
     legacy = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS))
     np.testing.assert_array_equal(given(legacy)[0], POINTS)
     tensors = o3d.t.geometry.PointCloud(o3d.core.Tensor(POINTS))

@@ -186,7 +186,7 @@ def test_pcd_ascii_binary_and_compressed(tmp_path):
 
 
 def test_pcd_back_references_unpack_as_open3d_packs_them(tmp_path):
-    o3d = pytest.importorskip("open3d", reason="the extra `baselines` is not installed")
+    o3d = pytest.importorskip("open3d", reason="Open3D is not here", exc_type=ImportError)
     points = np.repeat(np.arange(12.0).reshape(4, 3), 50, axis=0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     o3d.io.write_point_cloud(str(tmp_path / "a.pcd"), cloud, compressed=True)

@@ -229,7 +229,8 @@ def test_statistics_of_a_step_are_those_of_both_clouds_in_turn(seed):
     def one(source, reference, truth):
         return fmr.loss(variables, source, reference, truth, config=SMALL)[2]["batch_stats"]
 
-    found = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=None)(source, reference, truth)
+    step = jax.jit(jax.vmap(one, axis_name=BATCH_AXIS, out_axes=None))
+    found = step(source, reference, truth)
     layer = variables["params"]["encoder"]["Dense_0"]
     expected = variables["batch_stats"]["encoder"]["BatchNorm_0"]["BatchNorm_0"]["mean"]
     for points in (source.points, reference.points):
