@@ -2,14 +2,15 @@
 
 A part and its mirror image, or the same part five per cent larger, agree almost everywhere. Only at
 full density is the noise smaller than what they differ by. Where points lie off the other surface
-by many times the noise, the two usual causes are tried: does the mirrored source fit better, or the
-source at another size?
+by many times the noise, the usual causes are tried: does the source fit better at another size,
+stretched or sheared, or mirrored? Where a large share of all points lies off without such a cause, the
+surfaces are of different shapes.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxreg.scans import planes
 from jaxreg.scans.prepare import Prepared
@@ -30,10 +31,18 @@ _SPREAD = 1.15
 _BETTER = 0.4
 """Another cause fits better if it leaves this share of the points that are off."""
 _SIZES = 0.005
-"""The smallest change of size, as a share, that is told."""
+"""The smallest change of size, as a share, that is told; twice that between two directions."""
+_MOST = 0.25
+"""And the largest difference: a thin part fits anywhere where it may be pressed flat."""
+_DIFFERENT = 0.2
+"""Another shape, whatever the cause, if nearly all points can be compared and so many are off."""
 _ITERATIONS = 30
 _WIDEST = 3.0
 """Where the kernel ends, in the distances that it is to judge."""
+_OVER = 3.0
+"""A point lies over a patch if it is at most this many widths from its middle, along the plane."""
+_STIFF = 1e-6
+"""Against changes that the surfaces do not show, as a share of all that they show."""
 
 
 class Agreement(NamedTuple):
@@ -57,6 +66,11 @@ class Agreement(NamedTuple):
         """Whether nothing fits to the noise, as where a part that moved drew the pose along."""
         return self.compared >= _ENOUGH and self.spread >= _SPREAD
 
+    @property
+    def different(self) -> bool:
+        """Whether so many points lie off that these are surfaces of different shapes."""
+        return self.compared >= 0.9 and self.off >= _DIFFERENT
+
     def explains(self, other: "Agreement") -> bool:
         """Whether this is a far better fit than the other."""
         return self.compared >= 0.9 * other.compared and self.off <= _BETTER * other.off
@@ -66,19 +80,21 @@ def agreement(
     source: Prepared,
     reference: Prepared,
     pose: RigidTransform,
-    scale: float = 1.0,
+    change: Float[np.ndarray, "3 3"] | None = None,
     count: int = _SAMPLE,
 ) -> Agreement:
-    """How well `source`, times `scale` about its centre and then moved by `pose`, fits `reference`.
+    """How well `source`, changed about its centre and then moved by `pose`, fits `reference`.
 
-    `count` of its points are compared. The pose maps the centred source to the centred reference, both
-    in the unit of the input.
+    `change` is a matrix, none by default; `count` of the points are compared. The pose maps the centred
+    source to the centred reference, both in the unit of the input.
     """
     some, noise = _sampled(source, count)
-    moved = scale * some @ pose.rotation.T + pose.translation
+    change = np.eye(3) if change is None else change
+    moved = some @ change.T @ pose.rotation.T + pose.translation
     patches = _patches(reference, moved)
     off, beside = planes.offsets(moved, patches)
-    noise, typical = np.hypot(scale * noise, patches.noise), float(np.median(patches.width))
+    noise = np.hypot(np.cbrt(np.linalg.det(change)) * noise, patches.noise)
+    typical = float(np.median(patches.width))
     floored = np.maximum(noise, planes.FLOOR * typical)
     over = _over(off, beside, patches, floored)
     if not over.any():
@@ -105,17 +121,43 @@ def at_another_size(
     """
     some, noise = _sampled(source, _SAMPLE)
     unit = reference.radius
-    narrowest = min(3 * float(np.median(noise)) + planes.FLOOR * reach, reach)
     found = planes.fitted(
         some / unit,
         (reference.points, reference.tree),
         RigidTransform(pose.rotation, pose.translation / unit),
-        _WIDEST / unit * np.geomspace(reach, narrowest, _ITERATIONS),
+        _WIDEST / unit * _widths(noise, reach),
         motions=np.eye(6),
         scale=1.0,
     )
     pose = RigidTransform(found.pose.rotation, unit * found.pose.translation)
-    return found.scale, agreement(source, reference, pose, found.scale)
+    return found.scale, agreement(source, reference, pose, found.scale * np.eye(3))
+
+
+def stretched(
+    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
+) -> tuple[Float[np.ndarray, "3"], Agreement]:
+    """The sizes along three axes at which the source fits best, from `pose` on, and how well it fits.
+
+    The distances from planes are linear in the twelve numbers of ``A x + t``; the axes and sizes are
+    those of the stretch in ``A = R S`` (polar decomposition), so that shear is a stretch as well.
+    """
+    some, noise = _sampled(source, _SAMPLE)
+    matrix, shift = pose.rotation, pose.translation
+    for width in _widths(noise, reach):
+        moved = some @ matrix.T + shift
+        patches = _patches(reference, moved)
+        off, beside = planes.offsets(moved, patches)
+        weight = np.where(beside < _OVER * patches.width, planes.tukey(off / (_WIDEST * width)), 0)
+        by_matrix = patches.normal[:, :, None] * (some / source.radius)[:, None, :]
+        rows = np.column_stack([by_matrix.reshape(-1, 9), patches.normal])
+        normal = (rows * weight[:, None]).T @ rows
+        # What the surfaces leave free stays as it is.
+        normal += _STIFF * np.trace(normal) * np.eye(12)
+        step = np.linalg.solve(normal, -rows.T @ (weight * off))
+        matrix, shift = matrix + step[:9].reshape(3, 3) / source.radius, shift + step[9:]
+    left, sizes, right = np.linalg.svd(matrix)
+    pose = RigidTransform(left @ right, shift)
+    return sizes, agreement(source, reference, pose, right.T @ np.diag(sizes) @ right)
 
 
 def size_text(scale: float, now: Agreement, then: Agreement) -> str:
@@ -123,6 +165,33 @@ def size_text(scale: float, now: Agreement, then: Agreement) -> str:
     if abs(np.log(scale)) < _SIZES or not then.explains(now):
         return ""
     return f"The source fits at {scale:.3f} of its size."
+
+
+def stretch_text(sizes: Float[np.ndarray, "3"], now: Agreement, then: Agreement) -> str:
+    """A sentence on the sizes along three axes; empty if they are one, explain little or are absurd."""
+    stretch = np.log(sizes.max() / sizes.min())
+    if not 2 * _SIZES <= stretch <= _MOST or not then.explains(now):
+        return ""
+    return (
+        "The source is of another shape: it fits stretched, at "
+        f"{sizes.min():.3f} to {sizes.max():.3f} of its size."
+    )
+
+
+def different_text(now: Agreement) -> str:
+    """A sentence where a large share of the points lies off; else empty."""
+    if not now.different:
+        return ""
+    return (
+        f"{now.off:.0%} of the points lie over the other surface and off it by more than "
+        f"{_OFF:.0f} times the noise: it is of another shape."
+    )
+
+
+def _widths(noise: Float[np.ndarray, "p"], reach: float) -> Float[np.ndarray, "i"]:
+    """The distances that a kernel is to judge while it narrows from `reach` to the noise."""
+    narrowest = min(3 * float(np.median(noise)) + planes.FLOOR * reach, reach)
+    return np.geomspace(reach, narrowest, _ITERATIONS)
 
 
 def _sampled(cloud: Prepared, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -145,4 +214,4 @@ def _over(
 ) -> Bool[np.ndarray, "p"]:
     """Which points lie over their patch, and not so far off that it may be another surface."""
     typical = np.median(patches.width)
-    return (beside < 3 * patches.width) & (np.abs(off) < np.maximum(100 * noise, 10 * typical))
+    return (beside < _OVER * patches.width) & (np.abs(off) < np.maximum(100 * noise, 10 * typical))

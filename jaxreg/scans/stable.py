@@ -33,6 +33,8 @@ _STAYED, _MOVED = 1.25, 2.0
 _GAIN = 1.02
 """A pose is taken if so many times as many points agree with it: lie within one noise level. Within
 three a pose that was drawn along a little agrees about as well as the right one."""
+_MAJORITY = 0.6
+"""A pose that rests on a smaller share than this is no success: what moved, and what stayed?"""
 _LEAST = 1e-9
 
 
@@ -52,6 +54,16 @@ class Settled(NamedTuple):
     def better(self) -> bool:
         """Whether clearly more points agree than before."""
         return self.gain >= _GAIN
+
+    @property
+    def doubt(self) -> str:
+        """A sentence if too little stayed to tell what it is that moved; else empty."""
+        if self.stayed >= _MAJORITY:
+            return ""
+        return (
+            f"{1 - self.stayed:.0%} of the points moved or changed, so many that nothing tells which "
+            "part stayed: give weights if you know it."
+        )
 
 
 def settled(

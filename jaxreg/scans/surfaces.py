@@ -280,16 +280,24 @@ def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Cl
         settled = settled if settled.better or weights is not None else None
     if settled is not None:
         pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
-    asked = causes and now.suspicious
-    return _Closing(settled, _another_cause(problem, pose, now) if asked else "")
+    cause = ""
+    if causes and now.suspicious:
+        cause = _another_cause(problem, pose, now)
+        if not cause and weights is None:
+            # Where a part has moved, the points on it are off.
+            cause = settled.doubt if settled else dense.different_text(now)
+    return _Closing(settled, cause)
 
 
 def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
-    """A sentence if the clouds fit far better mirrored, or at another size; mostly there is none."""
+    """A sentence if the clouds fit far better at another size, stretched or mirrored."""
     source, reference, config = problem.source, problem.reference, problem.config
     reach = problem.distance * float(problem.where.length)
     scale, then = dense.at_another_size(source, reference, pose, reach)
     if told := dense.size_text(scale, now, then):
+        return told
+    sizes, then = dense.stretched(source, reference, pose, reach)
+    if told := dense.stretch_text(sizes, now, then):
         return told
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
     twin = pose_problem(mirrored, reference, config)

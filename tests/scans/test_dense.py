@@ -88,13 +88,54 @@ def test_another_size_is_found_from_a_pose_nearby(rng, factor):
     assert not dense.size_text(scale, now, now)
 
 
+SHEARED = np.array([[1.0, 0.08, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("change", [np.diag([1.0, 1.07, 0.96]), SHEARED], ids=["axes", "shear"])
+def test_a_stretch_is_found_from_a_pose_nearby(rng, change):
+    source, reference = prepared(stone(rng, 6000)), prepared(stone(rng, 6000) @ change.T)
+    start = between(source, reference, IDENTITY)
+    now = dense.agreement(source, reference, start)
+    sizes, then = dense.stretched(source, reference, start, 0.2)
+    np.testing.assert_allclose(sizes, np.linalg.svd(change, compute_uv=False), atol=0.006)
+    assert then.off < 0.1 * now.off
+    told = dense.stretch_text(sizes, now, then)
+    assert f"stretched, at {sizes.min():.3f} to {sizes.max():.3f} of its size" in told
+    assert not dense.stretch_text(sizes, now, now)
+    assert not dense.stretch_text(np.array([1.3, 1.301, 1.302]), now, then)
+    assert not dense.stretch_text(np.array([1.0, 1.0, 0.02]), now, then)
+
+
+def test_a_stretch_that_the_surfaces_do_not_show_is_none(rng):
+    """A plate with edges out of sight may be stretched along itself: it stays as it is."""
+    clouds = [rng.uniform(-1, 1, (6000, 3)) * [1, 1, 0.002] for _ in range(2)]
+    source, reference = map(prepared, clouds)
+    sizes, _ = dense.stretched(source, reference, between(source, reference, IDENTITY), 0.1)
+    assert sizes[0] == pytest.approx(1, abs=0.05)
+
+
+def test_a_bent_surface_is_of_another_shape(rng):
+    source, reference = plates(rng, 6000), plates(rng, 6000)
+    reference[:, 2] += 0.3 * reference[:, 0] ** 2
+    source, reference = prepared(source), prepared(reference)
+    bent = dense.agreement(source, reference, between(source, reference, IDENTITY))
+    assert "of another shape" in dense.different_text(bent)
+    assert not dense.different_text(bent._replace(compared=0.8))
+    assert not dense.different_text(bent._replace(off=0.1))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "told"),
-    [(np.array([1.0, -1.0, 1.0]), "mirrored source fits better"), (1.05, "The source fits at 1.0")],
+    [
+        (np.diag([1.0, -1.0, 1.0]), "mirrored source fits better"),
+        (1.05 * np.eye(3), "The source fits at 1.0"),
+        (np.diag([1.0, 1.0, 1.1]), "of another shape: it fits stretched"),
+        (SHEARED, "of another shape: it fits stretched"),
+    ],
 )
-def test_a_mirror_image_and_another_size_are_no_success(rng, change, told):
-    reference = moved(stone(rng, 6000) * change, *pose(rng))
+def test_a_mirror_image_and_another_size_or_shape_are_no_success(rng, change, told):
+    reference = moved(stone(rng, 6000) @ change.T, *pose(rng))
     found = register(stone(rng, 6000), reference, config=NARROW)
     assert not found.success
     assert found.probability == 0

@@ -84,6 +84,8 @@ def test_the_last_stage_leaves_out_what_slid():
     assert got.better
     share = np.mean(in_slide(*rng.uniform([0, 0], [200, 150], (20_000, 2)).T))
     assert abs(got.stayed - (1 - share)) < 0.15
+    assert not got.doubt
+    assert "70% of the points moved" in got._replace(stayed=0.3).doubt
 
 
 def test_the_last_stage_leaves_a_right_pose_alone():
