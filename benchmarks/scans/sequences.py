@@ -262,7 +262,9 @@ class Options:
 
 def write(rows: dict[str, dict]) -> None:
     """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as they are."""
-    kept = (record.read("sequences") or {"rows": {}})["rows"]
+    old = record.read("sequences") or {"rows": {}, "commit": ""}
+    kept = old["rows"]
+    others = ", ".join(kept[name]["label"] for name in VOXEL if name in kept and name not in rows)
     for name in VOXEL:
         if name in kept or name in rows:
             kept[name] = kept.get(name, {}) | rows.get(name, {})
@@ -272,6 +274,7 @@ def write(rows: dict[str, dict]) -> None:
         command=record.command("benchmarks.scans.sequences"),
         columns=COLUMNS,
         rows=kept,
+        note=f"Not made in this run, but at commit {old['commit']}: {others}." if others else None,
     )
 
 
