@@ -59,11 +59,12 @@ def test_every_name_is_a_method_of_a_batch_and_of_two_clouds(name, pair):
         assert angle_deg(outcome.transform, pair.transform) == pytest.approx(6.206, abs=1e-3)
         return
     for found in (outcome.transform, RigidTransform(batch.rotation[0], batch.translation[0])):
-        assert angle_deg(found, pair.transform) < (1 if name in WITHOUT_REFINEMENT else 0.1)
+        assert angle_deg(found, pair.transform) < WITHIN_DEG.get(name, 0.1)
         np.testing.assert_allclose(found.translation, pair.transform.translation, atol=0.02)
 
 
-WITHOUT_REFINEMENT = ("open3d_fgr", "open3d_fpfh_ransac")
+# Without a refinement; and networks that were trained for an hour.
+WITHIN_DEG = {"open3d_fgr": 1, "open3d_fpfh_ransac": 1, "weights:idam": 3, "weights:rpmnet": 3}
 
 
 def test_only_register_judges_itself(pair):

@@ -13,6 +13,7 @@ from flax.traverse_util import unflatten_dict
 
 from jaxreg.config import Config, from_dict
 from jaxreg.network.model import init_variables
+from jaxreg.peers import by_name
 from jaxreg.weights import released
 
 pytestmark = pytest.mark.float32
@@ -120,7 +121,7 @@ def test_shipped_weights_are_small_and_say_where_they_come_from(name):
 def test_shipped_networks_fit_the_network_of_their_configuration(name):
     assert {"seed", "step", "validation"} <= set(released.load_card(name))
     variables, config = released.load_pretrained(name)
-    fresh = init_variables(jax.random.key(0), config.model)
+    fresh = by_name.init_variables(jax.random.key(0), config)
     assert jax.tree.map(np.shape, fresh) == jax.tree.map(np.shape, variables)
 
 
