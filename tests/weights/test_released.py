@@ -77,7 +77,9 @@ def test_an_unknown_name_lists_the_known_ones(tmp_path):
 
 def test_the_features_of_the_search_are_not_a_network():
     assert "features" not in released.available_weights()
-    with pytest.raises(ValueError, match="'features' are not those of a network: choose from .*mod"):
+    with pytest.raises(
+        ValueError, match="'features' are not those of a network: choose from .*mod"
+    ):
         released.load_pretrained("features")
     arrays, card = released.load_arrays("features")
     assert {array.dtype for array in arrays.values()} == {np.dtype(np.float32)}
