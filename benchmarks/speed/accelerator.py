@@ -1,0 +1,120 @@
+"""Whether the device that JAX finds here agrees with its CPU, and how many pairs a second it takes.
+
+    python -m benchmarks.speed.accelerator [--points 512] [--pairs 16] [--batches 1 8 64 256]
+
+The same pairs run on both, by the same functions in float32. The network and the refinements must give
+the same poses up to rounding; the search chooses among candidates, and rounding may choose another one,
+so that most of its poses must agree. Exit status 1 if they do not: then something on that device is less
+exact than float32, as products are whose precision is not asked for. Where there is only a CPU it says so.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from benchmarks.speed import workload
+from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.network.model import register_pair
+from jaxreg.refine.gicp import gicp
+from jaxreg.refine.point_to_point import icp
+from jaxreg.search.pipeline import register_global
+
+_SAME_DEG = 0.05
+"""Rotations that differ by less are one: float32 and other orders of sums leave some .001."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to run."""
+
+    points: int = 512
+    """Points of each cloud."""
+    pairs: int = 16
+    """Pairs that are compared."""
+    batches: tuple[int, ...] = (1, 8, 64, 256)
+    """Sizes of a batch that are timed."""
+    rounds: int = 3
+    """Timed runs of every size; the fastest counts."""
+
+
+class Method(NamedTuple):
+    """A function of two clouds (n, 3), and the share of pairs on which devices must agree."""
+
+    run: Callable
+    least: float
+
+
+def methods() -> dict[str, Method]:
+    """The functions of one pair that run on any device."""
+    variables, config = workload.released()
+    network = functools.partial(register_pair, jax.device_get(variables), config=config)
+    return {
+        "register_pair": Method(network, 1.0),
+        "register_global": Method(register_global, 0.9),
+        "icp": Method(icp, 1.0),
+        "gicp": Method(gicp, 1.0),
+    }
+
+
+def rotations(
+    run: Callable, batch: workload.Batch, device: jax.Device
+) -> Float[np.ndarray, "b 3 3"]:
+    """What the function makes of a batch on a device."""
+    clouds = jax.device_put(batch[:2], device)
+    found = jax.jit(jax.vmap(lambda *pair: run(*pair).transform.rotation))(*clouds)
+    return np.asarray(found, np.float64)
+
+
+def agreement(
+    run: Callable, batch: workload.Batch, devices: tuple[jax.Device, jax.Device]
+) -> float:
+    """Share of the pairs whose rotations are the same on both devices."""
+    one, other = (rotations(run, batch, device) for device in devices)
+    return float(np.mean(rotation_angle_deg(one, other) < _SAME_DEG))
+
+
+def pairs_per_second(run: Callable, options: Options, size: int, device: jax.Device) -> float:
+    """Of a batch of `size` pairs that lies on the device, the fastest of some runs."""
+    drawn = workload.draw(options.points, min(size, options.pairs))
+    rows = np.arange(size) % len(drawn.sources)
+    clouds = jax.device_put((drawn.sources[rows], drawn.references[rows]), device)
+    compiled = jax.jit(jax.vmap(lambda *pair: run(*pair).transform.rotation))
+    jax.block_until_ready(compiled(*clouds))
+    taken = []
+    for _ in range(options.rounds):
+        begin = time.perf_counter()
+        jax.block_until_ready(compiled(*clouds))
+        taken.append(time.perf_counter() - begin)
+    return size / min(taken)
+
+
+def main(options: Options) -> int:
+    """Compare, time and print; the exit status."""
+    device, cpu = jax.devices()[0], jax.devices("cpu")[0]
+    print(f"{device.device_kind} ({device.platform}), {options.points} points")
+    alone = device.platform == "cpu"
+    if alone:
+        print("no accelerator: there is nothing to compare with the CPU")
+    batch = workload.draw(options.points, options.pairs)
+    failed = False
+    for name, (run, least) in methods().items():
+        told = f"{name:<16}"
+        if not alone:
+            share = agreement(run, batch, (device, cpu))
+            failed |= share < least
+            told += f"  same pose on {share:.0%} of {options.pairs} pairs (asked {least:.0%})"
+        for size in options.batches:
+            told += f"  {size}: {pairs_per_second(run, options, size, device):.3g}/s"
+        print(told, flush=True)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(tyro.cli(Options, description=__doc__)))
