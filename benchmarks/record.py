@@ -12,7 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 FOLDER = Path(__file__).parent / "results"
@@ -76,6 +76,14 @@ def read(name: str) -> dict | None:
     """NAME.json as it stands; None if there is none."""
     path = FOLDER / f"{name}.json"
     return json.loads(path.read_text("utf-8")) if path.is_file() else None
+
+
+def kept(old: dict, rows: Sequence[str]) -> str | None:
+    """A note on the rows that a run did not make and keeps from the record as it stood; none if none."""
+    if not rows:
+        return None
+    note = f"Not made in this run, but at commit {old['commit']}: figures of {', '.join(rows)}."
+    return " ".join(filter(None, [note, old.get("note")]))
 
 
 def command(module: str) -> str:

@@ -249,16 +249,13 @@ def columns_of(options: Options) -> dict[str, str]:
 
 def write(rows: dict[str, dict], options: Options) -> Path:
     """The record `peers`: a row a method."""
-    setting = {"pairs": options.pairs, "trained": len(options.runs)}
-    if set(options.only) == set(COLUMNS):
-        setting["kinds"] = len(COLUMNS)
     return record.write(
         "peers",
         question="What do the learned methods of the paper's table reach here?",
         command=record.command("benchmarks.paper.peers"),
         columns=columns_of(options),
         rows=rows,
-        setting=setting,
+        setting={"pairs": options.pairs, "trained": len(options.runs)},
     )
 
 

@@ -60,10 +60,8 @@ def _with_kept(
         }
         for key in dict.fromkeys([*rows, *old["rows"]])
     }
-    if not kept:
-        return merged, setting, None
-    note = f"Not made in this run, but at commit {old['commit']}: figures of {', '.join(kept)}."
-    return merged, old["setting"] | setting, " ".join(filter(None, [note, old.get("note")]))
+    told = old["setting"] | setting if kept else setting
+    return merged, told, record.kept(old, kept)
 
 
 def write_paper(cells: Cells, root: Path | None) -> Path:

@@ -260,21 +260,22 @@ class Options:
     """Write benchmarks/results/sequences.json."""
 
 
-def write(rows: dict[str, dict]) -> None:
-    """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as they are."""
-    old = record.read("sequences") or {"rows": {}, "commit": ""}
+def write(rows: dict[str, dict], old: dict) -> None:
+    """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as in `old`."""
     kept = old["rows"]
-    others = ", ".join(kept[name]["label"] for name in VOXEL if name in kept and name not in rows)
-    for name in VOXEL:
-        if name in kept or name in rows:
-            kept[name] = kept.get(name, {}) | rows.get(name, {})
+    others = [name for name in VOXEL if name in kept and name not in rows]
+    merged = {
+        name: kept.get(name, {}) | rows.get(name, {})
+        for name in VOXEL
+        if name in kept or name in rows
+    }
     record.write(
         "sequences",
         question="How many scans of whole sequences are placed?",
         command=record.command("benchmarks.scans.sequences"),
         columns=COLUMNS,
-        rows=kept,
-        note=f"Not made in this run, but at commit {old['commit']}: {others}." if others else None,
+        rows=merged,
+        note=record.kept(old, others),
     )
 
 
@@ -285,6 +286,8 @@ def main(options: Options) -> None:
         raise SystemExit("no data: set $JAXREG_DATA or give --data-root.")
     process.enable_compilation_cache(least_seconds=0.0)
     rows = {}
+    # As it stands before this run, which writes after every sequence.
+    old = record.read("sequences") or {"rows": {}}
     for name in options.sequences:
         found = sequence(root, name)
         if found is None:
@@ -297,7 +300,7 @@ def main(options: Options) -> None:
             rows[name] |= {f"{method}_{key}": row[key] for key in _FIGURES if key in row}
             print(method, rows[name], flush=True)
         if options.record:
-            write(rows)
+            write(rows, old)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ exact than float32, as products are whose precision is not asked for. Where ther
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,7 +18,8 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from benchmarks.speed import workload
+from benchmarks.speed import timing, workload
+from jaxreg.batching import map_pairs
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.network.model import register_pair
 from jaxreg.refine.gicp import gicp
@@ -67,9 +67,12 @@ def rotations(
     run: Callable, batch: workload.Batch, device: jax.Device
 ) -> Float[np.ndarray, "b 3 3"]:
     """What the function makes of a batch on a device."""
-    clouds = jax.device_put(batch[:2], device)
-    found = jax.jit(jax.vmap(lambda *pair: run(*pair).transform.rotation))(*clouds)
-    return np.asarray(found, np.float64)
+    return np.asarray(_batched(run)(*jax.device_put(batch[:2], device)), np.float64)
+
+
+def _batched(run: Callable) -> Callable:
+    """The compiled rotations of batches of pairs."""
+    return jax.jit(map_pairs(lambda *pair: run(*pair).transform.rotation))
 
 
 def agreement(
@@ -80,19 +83,17 @@ def agreement(
     return float(np.mean(rotation_angle_deg(one, other) < _SAME_DEG))
 
 
-def pairs_per_second(run: Callable, options: Options, size: int, device: jax.Device) -> float:
-    """Of a batch of `size` pairs that lies on the device, the fastest of some runs."""
-    drawn = workload.draw(options.points, min(size, options.pairs))
-    rows = np.arange(size) % len(drawn.sources)
-    clouds = jax.device_put((drawn.sources[rows], drawn.references[rows]), device)
-    compiled = jax.jit(jax.vmap(lambda *pair: run(*pair).transform.rotation))
-    jax.block_until_ready(compiled(*clouds))
-    taken = []
-    for _ in range(options.rounds):
-        begin = time.perf_counter()
-        jax.block_until_ready(compiled(*clouds))
-        taken.append(time.perf_counter() - begin)
-    return size / min(taken)
+def pairs_per_second(
+    run: Callable, batch: workload.Batch, options: Options, device: jax.Device
+) -> dict[int, float]:
+    """By the size of a batch, whose pairs are those of `batch` again and again; the fastest runs."""
+    compiled, tasks = _batched(run), {}
+    for size in options.batches:
+        rows = np.arange(size) % len(batch.sources)
+        clouds = jax.device_put((batch.sources[rows], batch.references[rows]), device)
+        tasks[str(size)] = lambda _, clouds=clouds: compiled(*clouds)
+    taken = timing.alternate(tasks, rounds=options.rounds)
+    return {size: size / taken[str(size)].minimum for size in options.batches}
 
 
 def main(options: Options) -> int:
@@ -110,8 +111,8 @@ def main(options: Options) -> int:
             share = agreement(run, batch, (device, cpu))
             failed |= share < least
             told += f"  same pose on {share:.0%} of {options.pairs} pairs (asked {least:.0%})"
-        for size in options.batches:
-            told += f"  {size}: {pairs_per_second(run, options, size, device):.3g}/s"
+        for size, rate in pairs_per_second(run, batch, options, device).items():
+            told += f"  {size}: {rate:.3g}/s"
         print(told, flush=True)
     return int(failed)
 

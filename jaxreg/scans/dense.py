@@ -39,8 +39,6 @@ _DIFFERENT = 0.2
 _ITERATIONS = 30
 _WIDEST = 3.0
 """Where the kernel ends, in the distances that it is to judge."""
-_OVER = 3.0
-"""A point lies over a patch if it is at most this many widths from its middle, along the plane."""
 _STIFF = 1e-6
 """Against changes that the surfaces do not show, as a share of all that they show."""
 
@@ -147,7 +145,8 @@ def stretched(
         moved = some @ matrix.T + shift
         patches = _patches(reference, moved)
         off, beside = planes.offsets(moved, patches)
-        weight = np.where(beside < _OVER * patches.width, planes.tukey(off / (_WIDEST * width)), 0)
+        over = beside < planes.WITHIN * patches.width
+        weight = np.where(over, planes.tukey(off / (_WIDEST * width)), 0)
         by_matrix = patches.normal[:, :, None] * (some / source.radius)[:, None, :]
         rows = np.column_stack([by_matrix.reshape(-1, 9), patches.normal])
         normal = (rows * weight[:, None]).T @ rows
@@ -214,4 +213,5 @@ def _over(
 ) -> Bool[np.ndarray, "p"]:
     """Which points lie over their patch, and not so far off that it may be another surface."""
     typical = np.median(patches.width)
-    return (beside < _OVER * patches.width) & (np.abs(off) < np.maximum(100 * noise, 10 * typical))
+    near = np.abs(off) < np.maximum(100 * noise, 10 * typical)
+    return (beside < planes.WITHIN * patches.width) & near

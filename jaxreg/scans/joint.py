@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxreg.geometry import se3, trees
+from jaxreg.geometry import se3
 from jaxreg.graph.pose_graph import EdgeEquations, PoseGraph, retract
 from jaxreg.graph.sparse import gauss_newton_steps
 from jaxreg.refine.kdtree import IndexedCloud
@@ -138,7 +138,7 @@ def _one_way(moving, still, moving_scale, still_scale, pose: RigidTransform, wit
     stride = _stride(moving)
     x = moving.points[::stride] * moving_scale
     moved = x @ pose.rotation.T + pose.translation
-    distance, index = trees.nearest(still.tree, moved / still_scale, within=within / still_scale)
+    distance, index = still._replace(scale=still_scale).nearest(moved, within=within)
     near = np.isfinite(distance)
     x, moved, index = x[near], moved[near], index[near]
     residual = moved - still.points[index] * still_scale
@@ -207,7 +207,7 @@ def _off(moving, still, moving_scale, still_scale, pose, reach) -> np.ndarray:
     stride = _stride(moving)
     others = moving.points[stride // 2 :: stride] * moving_scale
     moved = others @ pose.rotation.T + pose.translation
-    distance, index = trees.nearest(still.tree, moved / still_scale, within=reach / still_scale)
+    distance, index = still._replace(scale=still_scale).nearest(moved, within=reach)
     near = np.isfinite(distance)
     residual = moved[near] - still.points[index[near]] * still_scale
     off = np.full(len(moved), reach / 2)

@@ -21,7 +21,7 @@ TUKEY = 4.685
 FLOOR = 0.1
 """The noise is taken for at least so many widths of a patch: exact points have none, but poses are
 never exact, and curved surfaces are no planes."""
-_WITHIN = 3.0
+WITHIN = 3.0
 """A point lies over its patch if it is at most this many widths from the middle, along the plane."""
 _FEWEST = 20
 """Fewer points over patches say nothing."""
@@ -175,7 +175,7 @@ def _linear(source, reference, rotation, shift, size, count, flat):
     rows = np.column_stack(
         [np.cross(turned + shift, normal), normal, np.sum(turned * normal, axis=1)]
     )
-    return rows, off, beside < _WITHIN * found.width
+    return rows, off, beside < WITHIN * found.width
 
 
 def _covariance(rows, off, weight, given, moved, width) -> np.ndarray:

@@ -83,6 +83,7 @@ def test_a_record_has_its_fields(name):
     assert all(entry[field] for field in record.FIELDS)
     for row in entry["rows"].values():
         assert set(row) <= {"label", *entry["columns"]}
+        assert all(isinstance(row[key], str) for key in TEXTS if row.get(key) is not None)
         cells = [value for key, value in row.items() if key not in TEXTS]
         assert all(value is None or isinstance(value, int | float) for value in cells)
     assert all(isinstance(value, int | float) for value in entry.get("setting", {}).values())

@@ -487,6 +487,8 @@ def test_a_wrong_pose_says_why_and_names_the_others(pair):
     found = register(flat, flat + 0.001)
     assert not found.success
     assert found.reason.endswith(".")
+    tilted = flat @ pose(np.random.default_rng(3))[0].T
+    assert "leave the pose free: " in register(tilted, tilted + 0.001).reason
     assert register(*pair[:2]).reason == ""
     box = np.random.default_rng(1).uniform(-1, 1, size=(2, 600, 3)) * [1.0, 0.6, 0.4]
     side = np.random.default_rng(2).integers(0, 3, size=(2, 600))
