@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.transform import Rotation
 
 from jaxreg._xla import from_host
@@ -48,7 +47,7 @@ class IndexedCloud(NamedTuple):
     """
 
     points: Float[np.ndarray, "n 3"]
-    tree: cKDTree
+    tree: trees.Tree
     neighbors: Int[np.ndarray, "m k"]
     padded: Float[Array, "m 3"]
     normals: Float[Array, "m 3"]
@@ -87,7 +86,7 @@ def index_cloud(
     points: Float[np.ndarray, "n 3"], *, k: int, normals: Float[np.ndarray, "n 3"] | None = None
 ) -> IndexedCloud:
     """Tree, normals (from `k` neighbours, unless given) and edges of a cloud; fewer if it is small."""
-    tree = cKDTree(points)
+    tree = trees.Tree(points)
     found = min(k, len(points) - 1) + 1
     # One more than asked for: the point finds itself, and a row of its own index does not count.
     _, index = trees.neighbors(tree, points, found)

@@ -111,17 +111,22 @@ def at_a_glance(source: Prepared, reference: Prepared, pose: RigidTransform) -> 
 
 
 def at_another_size(
-    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
+    source: Prepared,
+    reference: Prepared,
+    pose: RigidTransform,
+    reach: float,
+    surface: planes.Surface,
 ) -> tuple[float, Agreement]:
     """The scale at which the source fits best, from `pose` on, and how well it fits there.
 
+    `surface` is the reference's, and `reach` the largest distance of corresponding points at first.
     Gauss-Newton on distances from planes, with a kernel that narrows to the noise; seven unknowns.
     """
     some, noise = _sampled(source, _SAMPLE)
     unit = reference.radius
     found = planes.fitted(
         some / unit,
-        (reference.points, reference.tree),
+        surface,
         RigidTransform(pose.rotation, pose.translation / unit),
         _WIDEST / unit * _widths(noise, reach),
         motions=np.eye(6),
@@ -132,7 +137,11 @@ def at_another_size(
 
 
 def stretched(
-    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
+    source: Prepared,
+    reference: Prepared,
+    pose: RigidTransform,
+    reach: float,
+    surface: planes.Surface,
 ) -> tuple[Float[np.ndarray, "3"], Agreement]:
     """The sizes along three axes at which the source fits best, from `pose` on, and how well it fits.
 
@@ -140,22 +149,24 @@ def stretched(
     those of the stretch in ``A = R S`` (polar decomposition), so that shear is a stretch as well.
     """
     some, noise = _sampled(source, _SAMPLE)
-    matrix, shift = pose.rotation, pose.translation
-    for width in _widths(noise, reach):
+    unit, radius = reference.radius, source.radius / reference.radius
+    some = some / unit
+    matrix, shift = pose.rotation, pose.translation / unit
+    for width in _widths(noise, reach) / unit:
         moved = some @ matrix.T + shift
-        patches = _patches(reference, moved)
+        patches = surface.next_to(moved)
         off, beside = planes.offsets(moved, patches)
         over = beside < planes.WITHIN * patches.width
         weight = np.where(over, planes.tukey(off / (_WIDEST * width)), 0)
-        by_matrix = patches.normal[:, :, None] * (some / source.radius)[:, None, :]
+        by_matrix = patches.normal[:, :, None] * (some / radius)[:, None, :]
         rows = np.column_stack([by_matrix.reshape(-1, 9), patches.normal])
         normal = (rows * weight[:, None]).T @ rows
         # What the surfaces leave free stays as it is.
         normal += _STIFF * np.trace(normal) * np.eye(12)
         step = np.linalg.solve(normal, -rows.T @ (weight * off))
-        matrix, shift = matrix + step[:9].reshape(3, 3) / source.radius, shift + step[9:]
+        matrix, shift = matrix + step[:9].reshape(3, 3) / radius, shift + step[9:]
     left, sizes, right = np.linalg.svd(matrix)
-    pose = RigidTransform(left @ right, shift)
+    pose = RigidTransform(left @ right, unit * shift)
     return sizes, agreement(source, reference, pose, right.T @ np.diag(sizes) @ right)
 
 

@@ -6,8 +6,8 @@ how the data were exported.
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxreg.geometry import trees
 from jaxreg.scans import strays
 
 _SAMPLE = 20_000
@@ -98,9 +98,9 @@ def _size(points: np.ndarray) -> float:
 def _neighbours(distinct: np.ndarray) -> np.ndarray:
     """Of a sample, the distance to the 4th nearest other point."""
     some = distinct[:: max(1, len(distinct) // _SAMPLE)]
-    k = min(5, len(distinct))
-    distance = cKDTree(distinct - distinct.mean(axis=0)).query(some - distinct.mean(axis=0), k=k)[0]
-    return np.asarray(distance)[:, -1]
+    middle = distinct.mean(axis=0)
+    tree, k = trees.Tree(distinct - middle), min(5, len(distinct))
+    return trees.neighbors(tree, some - middle, k)[0][:, -1]
 
 
 def _steps(distinct: np.ndarray, spacing: float, repeated: float) -> list[str]:

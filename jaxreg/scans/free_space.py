@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import trees
 from jaxreg.types import RigidTransform
@@ -43,7 +42,7 @@ class View(NamedTuple):
     """
 
     place: Float[np.ndarray, "3"]
-    tree: cKDTree
+    tree: trees.Tree
     distance: Float[np.ndarray, "d"]
     step: float
     blind: float
@@ -54,8 +53,9 @@ def view(points: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"]) -> Vie
     seen = points[:: max(1, len(points) // _DIRECTIONS)] - place
     distance = np.linalg.norm(seen, axis=1)
     seen, distance = seen[distance > 0], distance[distance > 0]
-    tree = cKDTree(seen / distance[:, None])
-    near = trees.neighbors(tree, tree.data[::5], min(_AROUND, len(seen) - 1) + 1)[0][:, -1]
+    directions = seen / distance[:, None]
+    tree = trees.Tree(directions)
+    near = trees.neighbors(tree, directions[::5], min(_AROUND, len(seen) - 1) + 1)[0][:, -1]
     blind = _BLIND * float(np.quantile(distance, _NEAREST))
     return View(place, tree, distance, float(np.median(near)), blind)
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import clouds as checks
 from jaxreg.geometry import trees
@@ -68,10 +67,10 @@ class Line(NamedTuple):
     """A cloud in the plane, around its centre in units of its radius, at two densities, indexed."""
 
     points: Float[np.ndarray, "n 3"]
-    tree: cKDTree
+    surface: planes.Surface
     normals: Float[np.ndarray, "n 3"]
     judged: Float[np.ndarray, "j 3"]
-    judged_tree: cKDTree
+    judged_tree: trees.Tree
     examined: Examined
     noise: float
 
@@ -139,19 +138,18 @@ def registered(
 
 def _line(cloud: Prepared) -> Line:
     points = cloud.fine.points * [1, 1, 0]
-    tree = cKDTree(points)
-    if cloud.fine.normals is None:
-        normals = planes.patches(points, tree, points, count=_NEIGHBORS, flat=True).normal
-    else:
-        normals = cloud.fine.normals
+    tree = trees.Tree(points)
+    surface = planes.Surface(points, tree, count=_NEIGHBORS, flat=True)
+    normals = cloud.fine.normals
+    normals = surface.next_to(points).normal if normals is None else normals
     judged = reduce_to(points, _JUDGED)
     noise = planes.patches(points, tree, judged, count=_NEIGHBORS, flat=True).noise
-    judged_tree = cKDTree(judged)
+    judged_tree = trees.Tree(judged)
     examined = _examined(judged, judged_tree, cloud)
-    return Line(points, tree, normals, judged, judged_tree, examined, float(np.median(noise)))
+    return Line(points, surface, normals, judged, judged_tree, examined, float(np.median(noise)))
 
 
-def _examined(points: Float[np.ndarray, "j 3"], tree: cKDTree, cloud: Prepared) -> Examined:
+def _examined(points: Float[np.ndarray, "j 3"], tree: trees.Tree, cloud: Prepared) -> Examined:
     """A line as the judge sees a surface: padded, with normals, corners, rare directions and ends."""
     count = min(_NEIGHBORS, len(points) - 1)
     distance, index = trees.neighbors(tree, points, count + 1)
@@ -217,9 +215,7 @@ def _closed(
 
 
 def _fitted(points: np.ndarray, y: Line, pose: RigidTransform, widths: np.ndarray) -> planes.Fitted:
-    return planes.fitted(
-        points, (y.points, y.tree), pose, widths, motions=MOTIONS, count=_NEIGHBORS, flat=True
-    )
+    return planes.fitted(points, y.surface, pose, widths, motions=MOTIONS)
 
 
 def _noise(x: Line, y: Line, ratio: float) -> float:

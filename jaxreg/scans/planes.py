@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import trees
 from jaxreg.types import RigidTransform
@@ -65,7 +64,7 @@ class Fitted(NamedTuple):
 
 def patches(
     points: Float[np.ndarray, "m 3"],
-    tree: cKDTree,
+    tree: trees.Tree,
     at: Float[np.ndarray, "p 3"],
     *,
     count: int = NEIGHBORS,
@@ -85,6 +84,41 @@ def patches(
     return Patches(centre, axes[:, :, 0], noise, width)
 
 
+class Surface:
+    """A cloud as the patches around its points, each made once: steps come back to the same points.
+
+    The patch next to any point is that around the nearest point of the cloud. `count` points make a
+    patch; `flat`: of lines in the plane z = 0.
+    """
+
+    def __init__(
+        self,
+        points: Float[np.ndarray, "m 3"],
+        tree: trees.Tree,
+        *,
+        count: int = NEIGHBORS,
+        flat: bool = False,
+    ) -> None:
+        """Makes no patch yet."""
+        self.points, self.tree, self.count, self.flat = points, tree, count, flat
+        self._made = np.zeros(len(points), bool)
+        vectors, numbers = np.empty((2, len(points), 3)), np.empty((2, len(points)))
+        self._patches = Patches(*vectors, *numbers)
+
+    def next_to(self, at: Float[np.ndarray, "p 3"]) -> Patches:
+        """The patches next to points."""
+        nearest = trees.nearest(self.tree, at)[1]
+        new = np.unique(nearest[~self._made[nearest]])
+        if len(new):
+            around = patches(
+                self.points, self.tree, self.points[new], count=self.count, flat=self.flat
+            )
+            for every, some in zip(self._patches, around, strict=True):
+                every[new] = some
+            self._made[new] = True
+        return Patches(*(leaf[nearest] for leaf in self._patches))
+
+
 def offsets(
     points: Float[np.ndarray, "p 3"], found: Patches
 ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
@@ -96,15 +130,13 @@ def offsets(
 
 def fitted(
     source: Float[np.ndarray, "p 3"],
-    reference: tuple[Float[np.ndarray, "m 3"], cKDTree],
+    reference: Surface,
     pose: RigidTransform,
     widths: Float[np.ndarray, "i"],
     *,
     motions: Float[np.ndarray, "6 f"],
     scale: float | None = None,
     weights: Float[np.ndarray, "p"] | None = None,
-    count: int = NEIGHBORS,
-    flat: bool = False,
 ) -> Fitted:
     """The pose after one step for each of `widths`, and the covariance at the last of them.
 
@@ -120,7 +152,7 @@ def fitted(
     given = np.ones(len(source)) if weights is None else weights
     last_step = np.inf
     for width in widths:
-        rows, off, over = _linear(source, reference, rotation, shift, size, count, flat)
+        rows, off, over = _linear(source, reference, rotation, shift, size)
         weight = np.where(over, given * tukey(off / width), 0)
         if np.sum(weight > 0) < _FEWEST:
             break
@@ -130,7 +162,7 @@ def fitted(
         rotation, shift = turn(step[:3]) @ rotation, turn(step[:3]) @ shift + step[3:6]
         last_step = float(max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])))
         size *= float(np.exp(np.clip(step[6], -_LONGEST, _LONGEST)))
-    rows, off, over = _linear(source, reference, rotation, shift, size, count, flat)
+    rows, off, over = _linear(source, reference, rotation, shift, size)
     last = float(widths[-1]) if len(widths) else np.inf
     weight = np.where(over, given * tukey(off / last), 0)
     moved = size * source @ rotation.T + shift
@@ -165,11 +197,10 @@ def turn(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-def _linear(source, reference, rotation, shift, size, count, flat):
+def _linear(source, reference: Surface, rotation, shift, size):
     """Derivatives of the distances by rotation vector, translation and log scale; distances; over."""
     turned = size * source @ rotation.T
-    points, tree = reference
-    found = patches(points, tree, turned + shift, count=count, flat=flat)
+    found = reference.next_to(turned + shift)
     off, beside = offsets(turned + shift, found)
     normal = found.normal
     rows = np.column_stack(

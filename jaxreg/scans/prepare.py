@@ -14,7 +14,6 @@ from typing import Literal
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg._xla import from_host
 from jaxreg.geometry import arguments, frame, trees
@@ -112,9 +111,9 @@ class Prepared:
     _thinned: dict[float, Level] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
-    def tree(self) -> cKDTree:
-        """Over all points; unbalanced, which is built in a third of the time and searched as fast."""
-        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+    def tree(self) -> trees.Tree:
+        """Over all points."""
+        return trees.Tree(self.points)
 
     @functools.cached_property
     def view(self) -> free_space.View | None:
@@ -293,7 +292,7 @@ def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, 
     return _means(points, chosen)
 
 
-def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> float:
+def spacing(points: Float[np.ndarray, "n 3"], tree: trees.Tree | None = None) -> float:
     """How far apart neighbouring points of the surface are: the median distance to the 4th nearest.
 
     On a surface covered by squares of edge a, one point each, this is about a; 0 for a single point.
@@ -301,7 +300,7 @@ def spacing(points: Float[np.ndarray, "n 3"], tree: cKDTree | None = None) -> fl
     k = min(_FOURTH, len(points) - 1)
     if k < 1:
         return 0.0
-    found = cKDTree(points) if tree is None else tree
+    found = trees.Tree(points) if tree is None else tree
     return float(np.median(trees.neighbors(found, points, k + 1)[0][:, -1]))
 
 
@@ -334,7 +333,7 @@ def _strays(
 
 def _level(points: np.ndarray, whole: np.ndarray, normals: np.ndarray | None, k: int) -> Level:
     if normals is not None:
-        normals = normals[trees.nearest(cKDTree(whole), points)[1]]
+        normals = normals[trees.nearest(trees.Tree(whole), points)[1]]
     return Level(points, normals, k)
 
 

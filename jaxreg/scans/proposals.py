@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import trees
 from jaxreg.scans.prepare import Prepared, in_steps
@@ -79,7 +78,7 @@ def overlaps(
         cloud = prepared[k]
         points = cloud.coarse.points * cloud.radius + cloud.centre
         clouds[k] = points @ matrix[:3, :3].T + matrix[:3, 3]
-    tree_of = {k: cKDTree(points) for k, points in clouds.items()}
+    tree_of = {k: trees.Tree(points) for k, points in clouds.items()}
     middles = {k: points.mean(axis=0) for k, points in clouds.items()}
     extents = {k: np.linalg.norm(p - middles[k], axis=1).max() for k, p in clouds.items()}
     found = {}
@@ -94,7 +93,7 @@ def overlaps(
     return found
 
 
-def _share(points: np.ndarray, tree: cKDTree, reach: float) -> float:
+def _share(points: np.ndarray, tree: trees.Tree, reach: float) -> float:
     rows = np.linspace(0, len(points) - 1, min(_SHOWN, len(points))).astype(int)
     distance, _ = trees.nearest(tree, points[rows], within=reach)
     return float(np.isfinite(distance).mean())

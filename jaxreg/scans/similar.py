@@ -109,16 +109,14 @@ def _one_way(
     unit = fixed.radius
     inner = centred(clouds, pose)
     rows = np.linspace(0, len(moving.points) - 1, min(_SAMPLE, len(moving.points))).astype(int)
-    whole, count = (fixed.points, fixed.tree), 8 if flat else planes.NEIGHBORS
-    patches = planes.patches(*whole, fixed.points[:: max(1, len(fixed.points) // 2000)])
+    some = fixed.points[:: max(1, len(fixed.points) // 2000)]
+    patches = planes.patches(fixed.points, fixed.tree, some)
     narrowest = min(planes.TUKEY * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
     return planes.fitted(
         moving.points[rows] * (moving.radius / unit),
-        whole,
+        planes.Surface(fixed.points, fixed.tree, count=8 if flat else planes.NEIGHBORS, flat=flat),
         RigidTransform(inner.rotation, inner.translation / unit),
         np.geomspace(_REACH, narrowest, _ITERATIONS),
         motions=np.eye(6)[:, [2, 3, 4]] if flat else known.motions,
         scale=1.0,
-        count=count,
-        flat=flat,
     )

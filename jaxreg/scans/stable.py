@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxreg.geometry import trees
 from jaxreg.scans import planes
@@ -79,25 +78,29 @@ def settled(
     Both are of the centred clouds in the unit of the input, in which points may lie `reach` off.
     """
     unit, motions = reference.radius, known.motions
-    whole = reference.points, reference.tree
+    surface = planes.Surface(reference.points, reference.tree)
+    finer = planes.Surface(reference.points, reference.tree, count=_NEIGHBORS)
     start = RigidTransform(pose.rotation, pose.translation / unit)
     few, many = _rows(source, _FIRST), _rows(source, _SECOND)
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
     given = np.ones(len(source.points)) if known.weights is None else known.weights
     noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
-    found = planes.fitted(first, whole, start, widths, motions=motions, weights=given[few])
-    around = trees.neighbors(cKDTree(second), second, min(_AROUND, len(second)))[1]
-    at = {"motions": motions, "count": _NEIGHBORS}
+    found = planes.fitted(first, surface, start, widths, motions=motions, weights=given[few])
+    around = trees.neighbors(trees.Tree(second), second, min(_AROUND, len(second)))[1]
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]
     for _ in range(_ROUNDS):
-        found = planes.fitted(second, whole, found.pose, np.zeros(0), **at)
+        found = planes.fitted(second, finer, found.pose, np.zeros(0), motions=motions)
         noise = max(_core(found.off[found.over & (given[many] > 0)]), least)
         stays = given[many] * _stayed(found.off, around, noise)
-        found = planes.fitted(second, whole, found.pose, noise * narrow, weights=stays, **at)
-    wider = planes.fitted(second, whole, found.pose, 1.5 * noise * narrow[-1:], weights=stays, **at)
-    before = planes.fitted(second, whole, start, np.zeros(0), **at)
+        found = planes.fitted(
+            second, finer, found.pose, noise * narrow, weights=stays, motions=motions
+        )
+    wider = planes.fitted(
+        second, finer, found.pose, 1.5 * noise * narrow[-1:], weights=stays, motions=motions
+    )
+    before = planes.fitted(second, finer, start, np.zeros(0), motions=motions)
     agree, agreed = (np.sum(one.over & (np.abs(one.off) < noise)) for one in (found, before))
     # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
     drawn = _difference(wider.pose, found.pose)

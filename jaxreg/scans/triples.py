@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
@@ -232,7 +231,7 @@ def _refitted(problem: _Problem, poses: RigidTransform, reach: float) -> list[So
 
 def _with_most_pairs(problem: _Problem, poses: RigidTransform, reach: float) -> list[int]:
     """The poses that bring most points of the source near one of the reference, the best first."""
-    tree = cKDTree(problem.reference)
+    tree = trees.Tree(problem.reference)
     chosen = np.arange(len(poses.rotation))
     step = -(-len(problem.source) // _GLANCE)
     # First by some of the points, where there are many poses.

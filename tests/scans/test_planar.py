@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg.geometry import trees
 from jaxreg.scans import correlation, planes
 from jaxreg.scans.pair import register
 from tests.scenes import angle_deg
@@ -181,8 +182,6 @@ def test_correlation_finds_the_turn_and_shift(seed):
 
 def test_planes_find_the_pose_of_exact_planes(seed):
     """Three plates that meet: any small motion is found, whatever it is."""
-    from scipy.spatial import cKDTree
-
     rng = np.random.default_rng(seed)
     plates = rng.uniform(0, 1, (900, 3))
     plates[:300, 0] = plates[300:600, 1] = plates[600:, 2] = 0
@@ -191,7 +190,7 @@ def test_planes_find_the_pose_of_exact_planes(seed):
     source = (inner - shift) @ rotation
     found = planes.fitted(
         source,
-        (plates, cKDTree(plates)),
+        planes.Surface(plates, trees.Tree(plates)),
         planes.RigidTransform(np.eye(3), np.zeros(3)),
         np.geomspace(0.2, 0.02, 12),
         motions=np.eye(6),
