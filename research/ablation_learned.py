@@ -8,7 +8,10 @@ no rotation changes, frozen. `none`, `self` and `gather` are the single neighbou
 counts it twice, and the 1-NN strategy (`ModelConfig.one_nn`); weights are equal, the row maxima of the
 final map, or the confidence of the paper's inlier network (lengths and angles, with the N_c most
 confident points or all). What is left to train are the sharpness of the distances and the inlier
-network, by the distance to the true pose. Every row has the same budget: procedural shapes,
+network, by the distance to the true pose. Ideas of the peers stand beside them: the matches of RPM-Net
+(Sinkhorn's iterations with a slack entry for each row and column, which takes what has no counterpart;
+its threshold is trained, the mass of a row is its weight), and a predicted overlap as IDAM and others
+have it (a network of 16 units over how well a point and its neighbours match at best). Every row has the same budget: procedural shapes,
 resampled, any rotation. The control without all of this is the search of `register_global` with the
 same features. Tested on pairs that were not trained on, one step, no refinement.
 """
@@ -37,6 +40,7 @@ from jaxreg.network.inliers import InlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import match, matching_maps, neighborhood_sum
 from jaxreg.network.model import neighborhood_graph
+from jaxreg.peers.rpmnet import sinkhorn
 from jaxreg.search import description
 from jaxreg.search.learned import load_features
 from jaxreg.search.pipeline import enter, search_poses
@@ -44,6 +48,8 @@ from jaxreg.types import Pair, PointCloud, RigidTransform
 from research import train_features as learned_features
 
 _MODEL = ModelConfig()
+_ROUNDS = 5
+"""Of Sinkhorn's iterations, as in RPM-Net."""
 TESTED = ("resampled", "resampled_jitter", "crops70")
 
 
@@ -51,7 +57,10 @@ class Row(NamedTuple):
     """Which neighbourhoods are matched, and what weighs the correspondences."""
 
     one_nn: Literal["none", "self", "gather"]
-    weights: Literal["equal", "peaks", "inliers", "all inliers"]
+    weights: Literal["equal", "peaks", "inliers", "all inliers", "overlap"]
+    slack: bool = False
+    """Matches by Sinkhorn's iterations with slack, in place of the paper's maps; the mass of a row is
+    its peak."""
 
 
 ROWS = {
@@ -64,6 +73,10 @@ ROWS = {
     "1-NN, peaks": Row("gather", "peaks"),
     "1-NN, inlier module (the paper)": Row("gather", "inliers"),
     "1-NN, inlier module, all points": Row("gather", "all inliers"),
+    "single neighbourhood, predicted overlap": Row("none", "overlap"),
+    "Sinkhorn with slack, mass": Row("none", "peaks", slack=True),
+    "Sinkhorn with slack, inlier module": Row("none", "inliers", slack=True),
+    "Sinkhorn with slack, predicted overlap": Row("none", "overlap", slack=True),
 }
 
 
@@ -115,25 +128,49 @@ def register_step(weights, described: Described, row: Row, *, train: bool):
         "self": lambda: distance,
         "gather": lambda: neighborhood_sum(distance, *(g.nearest for g in graphs)),
     }[row.one_nn]()
-    maps = matching_maps(distance, nearest, *(g.matching for g in graphs), alpha=_MODEL.alpha)
-    matches = match(maps.dual, maps.final, y)
+    if row.slack:
+        copy, peak = assigned(weights["threshold"] - distance, y)
+    else:
+        maps = matching_maps(distance, nearest, *(g.matching for g in graphs), alpha=_MODEL.alpha)
+        copy, _, peak = match(maps.dual, maps.final, y)
     statistics = weights["statistics"]
     if row.weights == "equal":
         trust = jnp.ones(len(x))
     elif row.weights == "peaks":
-        trust = matches.final_peak
+        trust = peak
+    elif row.weights == "overlap":
+        trust = overlap(weights["overlap"], cosines, graphs[0].neighbors)
     else:
-        structures = (structure(p, graphs[0].neighbors) for p in (x, matches.copy))
+        structures = (structure(p, graphs[0].neighbors) for p in (x, copy))
         inliers = {"params": weights["inliers"], "batch_stats": statistics}
         trust, updated = inlier_network().apply(
             inliers, *structures, everywhere[0], train=train, mutable=["batch_stats"]
         )
         statistics = updated["batch_stats"]
-    source, copy = x, matches.copy
+    source = x
     if row.weights == "inliers":
         chosen = select_inliers(trust, _MODEL.n_inliers)
         source, copy, trust = x[chosen], copy[chosen], trust[chosen]
     return weighted_procrustes(source, copy, trust), statistics
+
+
+def assigned(affinity, points):
+    """RPM-Net's copy of every source point, and the mass of its row."""
+    scores = sinkhorn(affinity, jnp.ones(affinity.shape, bool), rounds=_ROUNDS)
+    mass = jnp.sum(scores, axis=1)
+    copy = jnp.matmul(scores, points, precision=jax.lax.Precision.HIGHEST)
+    # Without any mass the copy does not matter, but its gradient must be finite.
+    return copy / jnp.maximum(mass, 1e-6)[:, None], mass
+
+
+def overlap(weights, cosines, neighbors):
+    """The predicted share of overlap around each point, in (0, 1)."""
+    best = jnp.max(cosines, axis=1)
+    around = best[neighbors]
+    mutual = best - jnp.max(cosines, axis=0)[jnp.argmax(cosines, axis=1)]
+    given = jnp.stack([best, jnp.mean(around, axis=1), jnp.min(around, axis=1), mutual], axis=1)
+    hidden = jnp.tanh(given @ weights["first"] + weights["bias"][None])
+    return jax.nn.sigmoid(hidden @ weights["second"])
 
 
 def inlier_network() -> InlierNetwork:
@@ -153,6 +190,12 @@ def init_weights(key: jax.Array) -> dict:
     made = inlier_network().init(key, given, given, jnp.ones(len(cloud), bool), train=False)
     return {
         "log_sharpness": jnp.log(20.0),
+        "threshold": jnp.asarray(2.0),
+        "overlap": {
+            "first": jax.random.normal(key, (4, 16)),
+            "bias": jnp.zeros(16),
+            "second": jnp.zeros(16),
+        },
         "inliers": made["params"],
         "statistics": made["batch_stats"],
     }

@@ -6,13 +6,12 @@ Fragments of 7Scenes *redkitchen* that overlap by half or more, thinned or fille
 turned. Prepared clouds and arrays by this library, arrays by an older checkout of it, and Open3D's
 RANSAC + ICP at the voxel size that suits these scans take turns, each in fresh processes, since which of
 two processes is the quicker one is partly chance (docs/notes/0055). A process counts with the least of
-ten calls, the mean over the pairs; ratios are within a round. By the clock: both use all cores.
+ten calls on each pair. Ratios are within a round. By the clock, since all use all cores.
 """
 
 import dataclasses
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -36,10 +35,12 @@ _LABELS = {
     "open3d": "Open3D FPFH + RANSAC + ICP",
 }
 COLUMNS = {
-    "s": "s, least",
-    "s_median": "s, median of the processes",
-    "of_open3d": "of Open3D's time",
-    "of_old": "of the older checkout's time",
+    "s": "s, median of the pairs",
+    "s_max": "s, longest pair",
+    "of_open3d": "of Open3D's time, median",
+    "of_open3d_max": "of Open3D's time, longest pair",
+    "of_old": "of the older checkout's time, median",
+    "of_old_max": "of the older checkout's time, longest pair",
 }
 
 
@@ -75,8 +76,8 @@ def write_pairs(path: Path, options: Options) -> None:
     np.savez(path, *(filled(x, rng) for case in cases for x in (case.source, case.reference)))
 
 
-def seconds(kind: str, path: Path, root: Path) -> float:
-    """Of the quickest call, the mean over the pairs, in a fresh process of a checkout.
+def seconds(kind: str, path: Path, root: Path) -> list[float]:
+    """Of the quickest call on each pair, in a fresh process of a checkout.
 
     Raises:
       RuntimeError: the process failed; the message ends with what it wrote.
@@ -91,28 +92,30 @@ def seconds(kind: str, path: Path, root: Path) -> float:
     )
     if process.returncode:
         raise RuntimeError(f"{kind} of {root} failed:\n{process.stderr[-2000:]}")
-    return statistics.mean(json.loads(process.stdout.splitlines()[-1]))
+    return json.loads(process.stdout.splitlines()[-1])
 
 
-def rows(taken: dict[str, list[float]]) -> dict[str, dict[str, str | float]]:
-    """The cells of every kind, its ratios the mean of those of the rounds."""
+def rows(taken: dict[str, list[list[float]]]) -> dict[str, dict[str, str | float]]:
+    """The cells of every kind, from its seconds by round and pair: medians over the rounds first."""
+    times = {kind: np.array(rounds) for kind, rounds in taken.items()}
 
-    def ratio(kind: str, to: str) -> dict[str, float]:
-        if to not in taken or to == kind:
+    def ratios(kind: str, to: str) -> dict[str, float]:
+        if to not in times or to == kind:
             return {}
-        ratios = [a / b for a, b in zip(taken[kind], taken[to], strict=True)]
-        return {f"of_{to}": statistics.mean(ratios)}
+        of_pairs = np.median(times[kind] / times[to], axis=0)
+        return {f"of_{to}": float(np.median(of_pairs)), f"of_{to}_max": float(of_pairs.max())}
 
-    return {
-        kind: {
+    def cells(kind: str) -> dict[str, str | float]:
+        of_pairs = np.median(times[kind], axis=0)
+        return {
             "label": _LABELS[kind],
-            "s": min(times),
-            "s_median": statistics.median(times),
-            **ratio(kind, "open3d"),
-            **ratio(kind, "old"),
+            "s": float(np.median(of_pairs)),
+            "s_max": float(of_pairs.max()),
+            **ratios(kind, "open3d"),
+            **ratios(kind, "old"),
         }
-        for kind, times in taken.items()
-    }
+
+    return {kind: cells(kind) for kind in taken}
 
 
 def main(options: Options) -> None:
@@ -128,7 +131,7 @@ def main(options: Options) -> None:
             for kind, root in kinds.items():
                 function = "arrays" if kind == "old" else kind
                 taken[kind].append(seconds(function, path, root))
-            print({kind: f"{times[-1]:.3f} s" for kind, times in taken.items()}, flush=True)
+            print({k: [f"{x:.3f}" for x in rounds[-1]] for k, rounds in taken.items()}, flush=True)
     table = rows(taken)
     for cells in table.values():
         print(cells)

@@ -310,7 +310,8 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
     if told := dense.stretch_text(sizes, now, then):
         return told
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
-    twin = pose_problem(mirrored, reference, config)
+    # Nearly all of both clouds overlap here, which needs no wider search.
+    twin = pose_problem(mirrored, reference, dataclasses.replace(config, wide=None))
     other = refine_pose(twin, searched(twin).pose).transform
     other = in_unit(other, float(twin.where.length))
     if dense.agreement(mirrored, reference, other).explains(now):

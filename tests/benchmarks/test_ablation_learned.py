@@ -14,7 +14,7 @@ pytestmark = pytest.mark.loose  # The network's weights are of float32.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", ablation_learned.ROWS.values(), ids="-".join)
+@pytest.mark.parametrize("row", ablation_learned.ROWS.values(), ids=list(ablation_learned.ROWS))
 def test_every_row_finds_the_pose_of_exact_matches(row, seed):
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
