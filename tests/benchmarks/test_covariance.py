@@ -13,7 +13,7 @@ from tests.scenes import shape
 def test_normal_errors_of_that_covariance_have_a_mean_of_one(seed):
     """The truth is drawn about the pose that is found; that no axis is mixed up shows in the mean."""
     rng = np.random.default_rng(seed)
-    reference = shape(rng, 400) + 5.0
+    reference = shape(rng, 400) + 1.0
     found = register(reference - [0.2, 0.1, 0.3], reference)
     spread = rng.normal(size=(6, 6)) * np.repeat([1e-3, 4e-3], 3)[:, None]
     stated = spread @ spread.T
