@@ -62,7 +62,7 @@ def kept_in(folder: Path) -> Iterator[None]:
 
 
 def _remove_old(folder: Path) -> None:
-    """Every version of the library, of JAX and of the settings has a folder and a list of what it used."""
+    """Every version (of the library, of JAX, of settings) has a folder, and a list of what it used."""
     for used in folder.glob("*.used"):
         if time.time() - used.stat().st_mtime > _UNUSED_SECONDS:
             shutil.rmtree(used.with_suffix(""), ignore_errors=True)
