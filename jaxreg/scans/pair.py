@@ -8,17 +8,7 @@ import numpy as np
 from jaxreg.geometry import arguments
 from jaxreg.geometry.clouds import check_pose
 from jaxreg.refine.config import check_options
-from jaxreg.scans import (
-    few,
-    free_space,
-    inside,
-    masks,
-    planar,
-    prepare,
-    similar,
-    surfaces,
-    verdict,
-)
+from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
@@ -162,9 +152,7 @@ def _of_one_size(
     found = surfaces.registered(
         source, reference, config, start, known, least=least, thorough=thorough
     )
-    rivals = np.array([other.probability for other in found.alternatives])
-    likely = verdict.is_success(found.probability, rivals, found.converged, least=verdict.LIKELY)
-    if likely or found.probability < least or not inside.is_possible(source, reference):
+    if found.success or found.probability < least or not inside.is_possible(source, reference):
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))
     return inside.registered(source, reference, config, start, tried, known)

@@ -327,7 +327,7 @@ def finished(
         refined, closing = unrefined(found.pose), _Closing()
     else:
         refined, closing = refine_pose(problem, found.pose), _Closing()
-        if thorough or found.probability >= verdict.LIKELY:
+        if thorough or found.probability >= verdict.TRUSTED:
             closing = _with_all_points(problem, refined, causes=thorough)
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause

@@ -10,10 +10,8 @@ from jaxreg.judge.odds import WEIGHTS, features
 from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import WeakDirection
 
-TRUSTED = 0.8
-"""Probability from which a registration counts as a success (docs/notes/0061)."""
-LIKELY = 0.5
-"""Probability from which a pose is more likely right than not."""
+TRUSTED = 0.5
+"""Probability from which a registration counts as a success."""
 RIVAL = 0.25
 """A pose is no success if another one is right with this probability: several agree then."""
 _VOLUME = 0.185
@@ -54,16 +52,10 @@ def fills_volume(*clouds: Examined) -> bool:
     )
 
 
-def is_success(
-    chance: float,
-    rivals: Float[np.ndarray, "k"],
-    converged: bool | None,
-    *,
-    least: float = TRUSTED,
-) -> bool:
-    """Whether a pose is to be trusted, from its probability (`least`) and those of the others."""
+def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | None) -> bool:
+    """Whether a pose is to be trusted, from its probability and those of the others."""
     alone = len(rivals) == 0 or float(np.max(rivals)) < RIVAL
-    return chance >= least and alone and converged is not False
+    return chance >= TRUSTED and alone and converged is not False
 
 
 def in_a_volume(found: Evidence, *clouds: Examined) -> str:
