@@ -10,8 +10,10 @@ import functools
 import hashlib
 import os
 import pickle
+import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from pathlib import Path
@@ -21,6 +23,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+_UNUSED_SECONDS = 30 * 86_400
+"""Programs of another version that no process used for so long are removed."""
 _lock = threading.RLock()  # a program that is traced may call another
 _folder: Path | None = None
 _programs: dict[Any, Callable[..., Any]] = {}
@@ -50,10 +54,19 @@ def kept_in(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             if names := [path.name for path in _used if path.parent == _folder]:
                 _write(used, "\n".join(names).encode())
+            _remove_old(folder)
     finally:
         _ahead.clear()
         _used.clear()
         _folder = before
+
+
+def _remove_old(folder: Path) -> None:
+    """Every version (of the library, of JAX, of settings) has a folder, and a list of what it used."""
+    for used in folder.glob("*.used"):
+        if time.time() - used.stat().st_mtime > _UNUSED_SECONDS:
+            shutil.rmtree(used.with_suffix(""), ignore_errors=True)
+            used.unlink()
 
 
 def call(function: Callable[..., Any], told: tuple, arguments: tuple, static: dict) -> Any:

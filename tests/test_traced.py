@@ -1,5 +1,7 @@
 """Kept programs: traced once for all processes, equal to the function, and never in the way of it."""
 
+import os
+import time
 from functools import partial
 from typing import NamedTuple
 
@@ -62,6 +64,22 @@ def test_the_next_process_traces_nothing_and_finds_the_same(tmp_path, another_pr
             same(function(PAIR, 2.0, power=2))
             same(function(PAIR, 3.0, power=2), factor=3.0)
         assert counted.traced == traces
+
+
+def test_programs_of_versions_that_nobody_used_for_a_month_are_removed(tmp_path, another_process):
+    for name, days in (("old", 31), ("other", 29)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "program").write_bytes(b"x")
+        used = tmp_path / f"{name}.used"
+        used.touch()
+        os.utime(used, 2 * (time.time() - 86_400 * days,))
+    another_process()
+    function = Counted().jitted()
+    with _traced.kept_in(tmp_path):
+        function(PAIR, 2.0, power=2)
+    left = {path.stem for path in tmp_path.iterdir()}
+    assert left == {"other", _traced._version()}
+    assert (tmp_path / "other" / "program").exists()
 
 
 def test_what_the_last_one_used_is_loaded_ahead(tmp_path, another_process):

@@ -103,7 +103,8 @@ def _run(options: Options, path: Path, given: Collection[str]) -> int:
     )
     if scored is None:
         say(
-            f"the batches of this process are in {options.parts}; those of others are still missing"
+            f"this process is done: its batches are in {options.parts}. The process that finds all of "
+            "them there, the last to end, prints the table."
         )
         return SUCCESS
     # Written even if the other fails, for a bad pose or a full disk: they hold minutes of work.

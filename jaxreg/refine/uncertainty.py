@@ -38,6 +38,9 @@ _PATCH = 30
 """Pairs of a patch: about twice the neighbours that share a plane."""
 _BINS = 1024
 """Numbers for patches."""
+LEAST_SPREAD = 0.25
+"""The least spread of the slopes of patches in any motion, in units of what independent errors would
+give. Few patches, or some that happen to agree, would say that a motion is known exactly."""
 _LEAST_CURVATURE = 0.1
 """Of E[psi']; below it the residuals are all outliers."""
 _PITCH = 0.1
@@ -180,7 +183,8 @@ def scan_covariance(
         B^-1 (c / (c - 6) sum_k g_k g_k^T) B^-1 * _BOTH_NOISY,
 
     with ``g_k`` the sum of ``psi(r_i) J_i^T n_i`` over patch k, about _PATCH pairs, and
-    ``B = E[psi'] sum_i J_i^T n_i n_i^T J_i``. A constant of every derivative.
+    ``B = E[psi'] S``, ``S = sum_i J_i^T n_i n_i^T J_i``. No eigenvalue of the sum relative to S is less
+    than LEAST_SPREAD ``E[psi^2]``. A constant of every derivative.
     """
     moved, reference = moved - centre[None, :], reference - centre[None, :]
     # A figure to read, not to descend on: which points share a patch is a discrete choice.
@@ -205,12 +209,30 @@ def scan_covariance(
     filled = jnp.sum(jax.ops.segment_sum(ones, patch, _BINS) > 0).astype(moved.dtype)
     sums = jax.ops.segment_sum(slopes * ones[:, None], patch, _BINS)
     meat = jnp.matmul(sums.T, sums, precision="highest") * filled / jnp.maximum(filled - 6, 1)
+    least = jnp.sum(jnp.where(counts, jnp.sum(force**2, axis=1), 0)) / number
+    meat = _raised_to(meat, stiffness, LEAST_SPREAD * least)
     covariance = jnp.matmul(
         jnp.matmul(bread, meat, precision="highest"), bread, precision="highest"
     )
     # Exact copies leave no residual, only the rounding of their coordinates.
     rounding = (10 * jnp.finfo(moved.dtype).eps * spread) ** 2
     return _BOTH_NOISY * (covariance + covariance.T) / 2 + rounding * _bounded_inverse(stiffness)
+
+
+def _raised_to(
+    matrix: Float[Array, "6 6"], unit: Float[Array, "6 6"], least: Float[Array, ""]
+) -> Float[Array, "6 6"]:
+    """The matrix with every eigenvalue relative to `unit` (of ``M v = l U v``) at least `least`."""
+    _, raised, vectors = _raised_eigenvalues(unit)
+    root = vectors * jnp.sqrt(raised)[None, :]
+    inverse = (vectors / jnp.sqrt(raised)[None, :]).T
+    within = jnp.matmul(
+        jnp.matmul(inverse, matrix, precision="highest"), inverse.T, precision="highest"
+    )
+    scaled, axes = singular_vectors(within)
+    values = jnp.maximum(jnp.sum(axes * scaled, axis=0), least)
+    half = jnp.matmul(root, axes * jnp.sqrt(values)[None, :], precision="highest")
+    return jnp.matmul(half, half.T, precision="highest")
 
 
 def _patches(points: Float[Array, "n 3"], edge: Float[Array, ""]) -> Int[Array, "n"]:

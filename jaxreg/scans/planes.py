@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxreg.geometry import trees
+from jaxreg.refine.uncertainty import LEAST_SPREAD
 from jaxreg.types import RigidTransform
 
 NEIGHBORS = 12
@@ -209,6 +210,18 @@ def _linear(source, reference: Surface, rotation, shift, size):
     return rows, off, beside < WITHIN * found.width
 
 
+def _raised_to(
+    matrix: Float[np.ndarray, "f f"], unit: Float[np.ndarray, "f f"], least: float
+) -> Float[np.ndarray, "f f"]:
+    """The matrix with every eigenvalue relative to `unit` at least so large."""
+    values, vectors = np.linalg.eigh(unit)
+    root = vectors * np.sqrt(np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
+    inverse = np.linalg.inv(root)
+    inner, axes = np.linalg.eigh(inverse @ matrix @ inverse.T)
+    half = root @ (axes * np.sqrt(np.maximum(inner, least)))
+    return half @ half.T
+
+
 def _covariance(rows, off, weight, given, moved, width) -> np.ndarray:
     """``B^-1 (sum_k g_k g_k^T) B^-1``, with the errors of the points of a patch k taken as one."""
     inside = weight > 0
@@ -228,4 +241,6 @@ def _covariance(rows, off, weight, given, moved, width) -> np.ndarray:
     sums = np.stack([np.bincount(cells, weights=column) for column in slopes[inside].T], axis=1)
     filled = len(sums)
     meat = sums.T @ sums * filled / max(filled - rows.shape[1], 1)
+    least = float(np.sum((weight * off) ** 2) / np.sum(given[inside]))
+    meat = _raised_to(meat, plain, LEAST_SPREAD * least)
     return _BOTH_NOISY * bread @ meat @ bread

@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 from jaxreg.geometry import rigid
 from jaxreg.refine import uncertainty as rooms
 from jaxreg.refine.config import RefineConfig
+from jaxreg.refine.correspondences import Pairs
 from jaxreg.refine.point_to_plane import point_to_plane
-from jaxreg.refine.uncertainty import weak_directions
+from jaxreg.refine.robust import Weighting
+from jaxreg.refine.uncertainty import LEAST_SPREAD, scan_covariance, weak_directions
 from jaxreg.types import RigidTransform
 from tests.compiled import pose_uncertainty
 
@@ -124,6 +126,31 @@ def test_covariance_is_that_of_repeated_measurements(seed):
     np.testing.assert_allclose(np.asarray(uncertainty.variance).mean(), sigma**2, rtol=0.1)
     whitened = np.linalg.solve(np.linalg.cholesky(predicted), motion.T)
     np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.3)
+
+
+@pytest.mark.parametrize("patches", [4, 6, 200])
+def test_few_patches_do_not_make_a_motion_certain(patches, seed):
+    """Points in a few small places: their slopes span fewer motions than there are."""
+    rng = np.random.default_rng(seed)
+    count = 600
+    place = rng.uniform(-1, 1, (patches, 3))[rng.integers(patches, size=count)]
+    moved = place + rng.normal(scale=1e-3, size=(count, 3))
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    sigma = 0.01
+    reference = moved + rng.normal(scale=sigma, size=(count, 1)) * normals
+    index = jnp.arange(count)
+    pairs = Pairs(index, index, jnp.ones(count, bool))
+    weighting = Weighting("none", None, np.inf, 1.0)
+    arrays = (jnp.asarray(x, jnp.float32) for x in (moved, reference, normals))
+    found = np.asarray(
+        scan_covariance(*arrays, pairs, weighting, jnp.zeros(3, jnp.float32)), np.float64
+    )
+    rows = np.concatenate([np.cross(moved, normals), normals], axis=1)
+    independent = sigma**2 * np.linalg.inv(rows.T @ rows)
+    half = np.linalg.inv(np.linalg.cholesky(independent))
+    least = np.linalg.eigvalsh(half @ found @ half.T).min()
+    assert least > 0.8 * 1.9 * LEAST_SPREAD  # .8: what the noise of 600 points and float32 leave
 
 
 def test_finite_without_pairs_and_without_normals():
