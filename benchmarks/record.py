@@ -82,8 +82,10 @@ def kept(old: dict, rows: Sequence[str]) -> str | None:
     """A note on the rows that a run did not make and keeps from the record as it stood; none if none."""
     if not rows:
         return None
-    note = f"Not made in this run, but at commit {old['commit']}: figures of {', '.join(rows)}."
-    return " ".join(filter(None, [note, old.get("note")]))
+    told, note = f"figures of {', '.join(rows)}.", old.get("note") or ""
+    if told in note:  # The run before did not make them either, and says which one did.
+        return note
+    return f"Not made in this run, but at commit {old['commit']}: {told} {note}".strip()
 
 
 def command(module: str) -> str:

@@ -111,6 +111,17 @@ def test_written_is_what_was_measured(tmp_path):
     assert re.search(r"\S, \d+ cores, \w+, Python 3\.\d+\.\d+, JAX \d", entry["machine"])
 
 
+def test_rows_that_stay_keep_the_commit_that_made_them():
+    """Also where two runs, one after the other, leave them out."""
+    first = record.kept({"commit": "aaaaaaa", "note": "Shapes."}, ["icp", "fgr"])
+    assert first == "Not made in this run, but at commit aaaaaaa: figures of icp, fgr. Shapes."
+    assert record.kept({"commit": "bbbbbbb", "note": first}, ["icp", "fgr"]) == first
+    other = record.kept({"commit": "bbbbbbb", "note": first}, ["icp"])
+    assert other is not None
+    assert other.startswith("Not made in this run, but at commit bbbbbbb: figures of icp. Not made")
+    assert record.kept({"commit": "bbbbbbb"}, []) is None
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
