@@ -264,6 +264,11 @@ def write(rows: dict[str, dict], old: dict) -> None:
     """The record, in which other sequences and Open3D's figures (minutes a sequence) stay as in `old`."""
     kept = old["rows"]
     others = [name for name in VOXEL if name in kept and name not in rows]
+    others += [
+        f"Open3D on {name}"
+        for name, row in rows.items()
+        if "open3d_right" in kept.get(name, {}) and "open3d_right" not in row
+    ]
     merged = {
         name: kept.get(name, {}) | rows.get(name, {})
         for name in VOXEL
