@@ -14,6 +14,7 @@ from jaxreg.cli.register import (
     OptionalPath,
     Output,
     Viewpoint,
+    check_columns,
     check_picture,
     checked_scan,
     patience,
@@ -91,6 +92,7 @@ class Align:
             for k, path in enumerate(self.scans):
                 progress(k, len(self.scans), f"reading {path.name}")
                 scans.append(checked_scan(path, self.nonfinite))
+            check_columns(self.scans, scans)
             alignment = register_many(
                 [scan.points for scan in scans],
                 order=_order(self),

@@ -5,7 +5,7 @@ import dataclasses
 import importlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -101,6 +101,7 @@ class Register:
 
             initial = io.read_matrix(self.initial) if self.initial else None
             scans = [checked_scan(path, self.nonfinite) for path in (self.source, self.reference)]
+            check_columns([self.source, self.reference], scans)
             begin = time.perf_counter()
             result = _registered(self, scans, initial)
             seconds = time.perf_counter() - begin
@@ -250,6 +251,20 @@ def checked_scan(path: Path, nonfinite: str) -> "Scan":
         )
     clouds.check_points(points, str(path), nonfinite="drop")
     return scan
+
+
+def check_columns(paths: Sequence[Path], scans: Sequence["Scan"]) -> None:
+    """Raise ValueError where a file of x and y stands beside one whose points have a height."""
+    from jaxreg.io.contents import TWO_COLUMNS
+
+    named = list(zip(paths, scans, strict=True))
+    flat = next((path for path, scan in named if TWO_COLUMNS in scan.notes), None)
+    tall = next((path for path, scan in named if np.ptp(scan.points[:, 2]) > 0), None)
+    if flat is not None and tall is not None:
+        raise ValueError(
+            f"{flat} has two columns, x and y, and {tall} has three: give all in the plane, or all "
+            "in space."
+        )
 
 
 def _write_results(

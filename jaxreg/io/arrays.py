@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxreg.io.contents import Scan
+from jaxreg.io.contents import TWO_COLUMNS, Scan
 
 
 def read(path: Path) -> Scan:
@@ -21,8 +21,8 @@ def read(path: Path) -> Scan:
         told = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} cannot be read as {path.suffix} ({told}): {hint}.") from None
     if isinstance(content, dict):
-        return Scan(_chosen(content, path))
-    return Scan(_points(content, str(path)))
+        return _chosen(content, path)
+    return _scan(content, str(path))
 
 
 def read_arrays(
@@ -80,16 +80,21 @@ def _loaded(path: Path) -> np.ndarray | dict[str, np.ndarray]:
         return {name: content[name] for name in content.files}
 
 
-def _chosen(named: dict[str, np.ndarray], path: Path) -> np.ndarray:
+def _chosen(named: dict[str, np.ndarray], path: Path) -> Scan:
     if "points" in named:
-        return _points(named["points"], f"{path}['points']")
+        return _scan(named["points"], f"{path}['points']")
     clouds = [name for name, array in named.items() if array.ndim == 2 and array.shape[1] >= 3]
     if len(clouds) != 1:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in named.items())
         raise ValueError(
             f"{path} contains {shapes or 'nothing'}: save the cloud (n, 3) under the name 'points'."
         )
-    return _points(named[clouds[0]], f"{path}['{clouds[0]}']")
+    return _scan(named[clouds[0]], f"{path}['{clouds[0]}']")
+
+
+def _scan(array: np.ndarray, where: str) -> Scan:
+    planar = array.ndim == 2 and array.shape[1] == 2
+    return Scan(_points(array, where), (TWO_COLUMNS,) if planar else ())
 
 
 def _points(array: np.ndarray, where: str) -> np.ndarray:

@@ -5,6 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+TWO_COLUMNS = "two columns: z is 0"
+"""The note of a file of x and y alone."""
+
 
 class Scan(NamedTuple):
     """The points of a file, and what a reader of them should know ("a mesh of 12 faces ...").

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxreg.io.contents import Scan
+from jaxreg.io.contents import TWO_COLUMNS, Scan
 from jaxreg.io.decoding import decoded, number
 from jaxreg.io.layout import Layout, is_data, lines, recognised, split, uncommented
 from jaxreg.io.matrix import turn_of
@@ -37,7 +37,7 @@ def read(path: Path) -> Scan:
             "gdal_translate -of XYZ grid.asc points.xyz."
         )
     if (planar := _in_plane(text)) is not None:
-        return Scan(planar, ("two columns: z is 0",))
+        return Scan(planar, (TWO_COLUMNS,))
     layout = recognised(path, text)
     if layout is None:
         return Scan(np.empty((0, 3)))

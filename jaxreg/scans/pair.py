@@ -54,7 +54,7 @@ def register(
     coordinates; a pair of them is of source and reference, None of an unknown one. Poses that put
     points between a scanner and what it measured are then held to be wrong. `nonfinite` and
     `strays` say what to do with rows that are NaN or infinite, and with a few points that lie ten
-    times as far from the middle as all others. The same input gives the same bits.
+    times as far from the middle as all others. The same input gives the same bits on as many cores.
 
     Raises:
       ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the

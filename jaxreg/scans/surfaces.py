@@ -343,12 +343,12 @@ def finished(
         judged, source.fine.examined, problem.reference.fine.examined
     )
     likelihood = chances(np.array([score[0], *(s for _, s in found.others)]))
-    chance = 0.0 if cause or verdict.is_free(judged) else float(likelihood[0])
-    success = verdict.is_success(chance, likelihood[1:], refined.converged)
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(problem.known.held(refined.uncertainty))
     )
+    chance = 0.0 if cause or verdict.is_free(judged, weak) else float(likelihood[0])
+    success = verdict.is_success(chance, likelihood[1:], refined.converged)
     reason = ""
     if not success:
         rivals = float(likelihood[1:].sum())

@@ -39,9 +39,9 @@ _SPEAKS = Evidence(
 _features = from_host(jax.jit(features))
 
 
-def is_free(found: Evidence) -> bool:
-    """Whether the near surfaces leave a motion free."""
-    return bool(found.held < _LEAST_HELD)
+def is_free(found: Evidence, weak: tuple[WeakDirection, ...] = ()) -> bool:
+    """Whether the near surfaces leave a motion free, or the pairs of the refinement do (`weak`)."""
+    return found.held < _LEAST_HELD or any(one.strength < _LEAST_HELD for one in weak)
 
 
 def fills_volume(*clouds: Examined) -> bool:
@@ -70,7 +70,7 @@ def reason(found: Evidence, weak: tuple[WeakDirection, ...], rivals: float) -> s
 
     `rivals` is the probability that another of the poses is right.
     """
-    if is_free(found):
+    if is_free(found, weak):
         free = ", ".join(direction.name for direction in weak) or "a motion"
         return f"The surfaces leave the pose free: {free}."
     if rivals >= RIVAL:

@@ -130,6 +130,29 @@ def test_files_of_two_columns_are_in_the_plane(tmp_path, run, separator):
     np.testing.assert_allclose(found["rotation"], TURN, atol=1e-4)
 
 
+@pytest.mark.parametrize("suffix", ["txt", "npy", "npz"])
+def test_a_file_of_two_columns_beside_one_of_three_is_refused(tmp_path, run, suffix):
+    points = np.random.default_rng(3).uniform(0, 50, (80, 3))
+    plan = tmp_path / f"plan.{suffix}"
+    write = {"txt": np.savetxt, "npy": np.save, "npz": lambda file, x: np.savez(file, points=x)}
+    write[suffix](plan, points[:, :2])
+    for name in ("b.txt", "c.txt"):
+        np.savetxt(tmp_path / name, points)
+    for command, files in (
+        ("register", (plan, tmp_path / "b.txt")),
+        ("register", (tmp_path / "b.txt", plan)),
+        ("align", (tmp_path / "b.txt", plan, tmp_path / "c.txt")),
+    ):
+        status, _, err = run(command, *files)
+        assert status == BAD_INPUT
+        assert "has two columns, x and y, and" in err
+        assert err.strip().splitlines()[-1].startswith("error: ")
+    # A floor plan may stand beside a scan whose height is the same everywhere.
+    points[:, 2] = 7
+    np.savetxt(tmp_path / "b.txt", points)
+    assert run("register", plan, tmp_path / "b.txt")[0] == SUCCESS
+
+
 def test_few_points_have_no_scale(targets, run):
     status, _, err = run("register", *targets, "--scale")
     assert status == BAD_INPUT

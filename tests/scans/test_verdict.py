@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import verdict
+from jaxreg.scans.pair import register
 
 GOOD = Evidence(
     smaller=0.9, larger=0.95, distance=0.15, rough_distance=0.2, rough_facing=0.95,
@@ -13,6 +15,17 @@ GOOD = Evidence(
 )  # fmt: skip
 SLIDE = WeakDirection("translation", np.array([1.0, 0, 0]), np.zeros(3), 1e-4)
 TURN = WeakDirection("rotation", np.array([0.0, 0, 1]), np.zeros(3), 2e-4)
+
+
+@pytest.mark.parametrize(("n", "m"), [(50, 40), (60, 20)])
+def test_a_tilted_raster_of_a_plane_is_no_success(n, m):
+    """Its points coincide under several poses; none of them is held by the surfaces."""
+    flat = np.stack(np.meshgrid(np.arange(float(n)), np.arange(float(m)), [0.0]), -1).reshape(-1, 3)
+    turn = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+    found = register(flat, flat @ turn.T + [0.3, -0.2, 0.5])
+    assert found.weak_directions
+    assert not found.success
+    assert "leave the pose free: " in found.reason
 
 
 def test_planes_leave_the_pose_free_and_say_which_motions():
