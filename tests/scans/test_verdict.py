@@ -28,6 +28,13 @@ def test_a_tilted_raster_of_a_plane_is_no_success(n, m):
     assert "leave the pose free: " in found.reason
 
 
+def test_a_motion_that_the_refinement_leaves_free_is_free_whatever_the_evidence_says():
+    assert not verdict.is_free(GOOD, (SLIDE, TURN)), "weak, but not free"
+    free = SLIDE._replace(strength=1e-9)
+    assert verdict.is_free(GOOD, (TURN, free))
+    assert "leave the pose free: translation" in verdict.reason(GOOD, (free,), 0.0)
+
+
 def test_planes_leave_the_pose_free_and_say_which_motions():
     """What `held` is for a plane is tested with the evidence: about a millionth."""
     free = GOOD._replace(held=1e-6)
