@@ -13,11 +13,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
 from benchmarks import record
-from benchmarks.scans import protocols
+from benchmarks.scans import protocols, sensors
 from jaxreg.cli.process import enable_compilation_cache
+from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.scans.pair import register
 from jaxreg.scans.result import ScanRegistration
 from jaxreg.types import Pair
@@ -45,17 +45,13 @@ class Options:
 
 
 def nees(found: ScanRegistration, pair: Pair) -> float | None:
-    """Squared error over covariance, for each degree of freedom; None for a pose that is wrong."""
-    rotation, translation = (np.asarray(part, np.float64) for part in pair.transform)
-    turn = rotation @ found.rotation.T
-    centre = np.asarray(pair.reference.points, np.float64).mean(axis=0)
-    shift = translation - centre - turn @ (found.translation - centre)
-    vector = Rotation.from_matrix(turn).as_rotvec()
-    apart = np.linalg.norm(translation - found.translation)
-    if np.degrees(np.linalg.norm(vector)) > 5 or apart > 0.1:
+    """That of `benchmarks.scans.sensors`; None for a pose that is wrong."""
+    truth = np.eye(4)
+    truth[:3, :3], truth[:3, 3] = (np.asarray(part) for part in pair.transform)
+    angle = rotation_angle_deg(found.rotation, truth[:3, :3])
+    if angle > 5 or np.linalg.norm(truth[:3, 3] - found.translation) > 0.1:
         return None
-    error = np.concatenate([vector, shift])
-    return float(error @ np.linalg.solve(found.covariance, error) / 6)
+    return sensors.nees(found, truth, np.asarray(pair.reference.points, np.float64).mean(axis=0))
 
 
 def measure(protocol: str, shapes: protocols.Shapes, options: Options) -> Iterator[float | None]:

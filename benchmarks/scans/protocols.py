@@ -12,6 +12,7 @@ unless it says "all". Milliseconds are those of the processor.
 
 import dataclasses
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -130,12 +131,17 @@ def draw(key, shape, *, config: PairConfig, turned: bool) -> Pair:
     return Pair(source, pair.reference, rigid.compose(pair.transform, rigid.inverse(turn)))
 
 
+def drawn_from(shapes: Shapes, *, pairs: int, seed: int) -> Iterator[tuple[int, jax.Array]]:
+    """The index of the shape of every pair, and the key that it is drawn with."""
+    order = np.random.default_rng(seed).permutation(len(shapes.clouds))
+    for number, shape in enumerate(np.resize(order, pairs)):
+        yield shape, jax.random.fold_in(jax.random.key(seed), number)
+
+
 def draw_pairs(config: PairConfig, shapes: Shapes, *, pairs: int, seed: int, turned: bool):
     """The index of a shape and its pair, the same ones for every method."""
     config = at_size(config, shapes.clouds.shape[1])
-    order = np.random.default_rng(seed).permutation(len(shapes.clouds))
-    for number, shape in enumerate(np.resize(order, pairs)):
-        key = jax.random.fold_in(jax.random.key(seed), number)
+    for shape, key in drawn_from(shapes, pairs=pairs, seed=seed):
         yield shape, draw(key, shapes.clouds[shape], config=config, turned=turned)
 
 

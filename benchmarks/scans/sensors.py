@@ -178,20 +178,18 @@ def measure(root: Path, sensor: str, *, viewpoint: bool = False) -> Iterator[dic
             "listed": right or listed,
             "success": found.success,
             "probability": found.probability,
-            "nees": nees(found, pair) if right else None,
+            "nees": nees(found, pair.truth, pair.reference.mean(axis=0)) if right else None,
             "seconds": seconds,
         }
 
 
-def nees(found: "ScanRegistration", pair: TruePair) -> float:
+def nees(found: "ScanRegistration", truth: np.ndarray, centre: np.ndarray) -> float:
     """Squared error over covariance, for each of six degrees of freedom; 1 where sigma is right.
 
-    The error of the truth itself is in it.
+    `truth` is 4x4, `centre` what the covariance is about. The error of the truth itself is in it.
     """
-    assert pair.truth is not None
-    centre = pair.reference.mean(axis=0)
-    turn = pair.truth[:3, :3] @ found.rotation.T
-    shift = pair.truth[:3, 3] - centre - turn @ (found.translation - centre)
+    turn = truth[:3, :3] @ found.rotation.T
+    shift = truth[:3, 3] - centre - turn @ (found.translation - centre)
     error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift])
     return float(error @ np.linalg.solve(found.covariance, error) / 6)
 

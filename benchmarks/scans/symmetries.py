@@ -65,11 +65,10 @@ def _undrawn(key: jax.Array, shape: jax.Array, *, config: PairConfig) -> RigidTr
 def cases(protocol: str, shapes: protocols.Shapes, seed: int, options: Options) -> Iterator[Case]:
     """The pairs of `protocols.draw_pairs` that are not of a rotation-symmetric category."""
     config = protocols.at_size(protocols.pairs_of(protocol), shapes.clouds.shape[1])
-    order = np.random.default_rng(seed).permutation(len(shapes.clouds))
-    for number, row in enumerate(np.resize(order, options.pairs)):
+    for row, key in protocols.drawn_from(shapes, pairs=options.pairs, seed=seed):
         if shapes.categories[row] in protocols.SYMMETRIC:
             continue
-        key, shape = jax.random.fold_in(jax.random.key(seed), number), shapes.clouds[row]
+        shape = shapes.clouds[row]
         pair = protocols.draw(key, shape, config=config, turned=True)
         yield Case(pair, _moved(shape, _undrawn(key, shape, config=config)))
 

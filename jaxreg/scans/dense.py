@@ -111,22 +111,18 @@ def at_a_glance(source: Prepared, reference: Prepared, pose: RigidTransform) -> 
 
 
 def at_another_size(
-    source: Prepared,
-    reference: Prepared,
-    pose: RigidTransform,
-    reach: float,
-    surface: planes.Surface,
+    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
 ) -> tuple[float, Agreement]:
     """The scale at which the source fits best, from `pose` on, and how well it fits there.
 
-    `surface` is the reference's, and `reach` the largest distance of corresponding points at first.
+    `reach` is the largest distance of corresponding points at first.
     Gauss-Newton on distances from planes, with a kernel that narrows to the noise; seven unknowns.
     """
     some, noise = _sampled(source, _SAMPLE)
     unit = reference.radius
     found = planes.fitted(
         some / unit,
-        surface,
+        reference.surface,
         RigidTransform(pose.rotation, pose.translation / unit),
         _WIDEST / unit * _widths(noise, reach),
         motions=np.eye(6),
@@ -137,11 +133,7 @@ def at_another_size(
 
 
 def stretched(
-    source: Prepared,
-    reference: Prepared,
-    pose: RigidTransform,
-    reach: float,
-    surface: planes.Surface,
+    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
 ) -> tuple[Float[np.ndarray, "3"], Agreement]:
     """The sizes along three axes at which the source fits best, from `pose` on, and how well it fits.
 
@@ -154,7 +146,7 @@ def stretched(
     matrix, shift = pose.rotation, pose.translation / unit
     for width in _widths(noise, reach) / unit:
         moved = some @ matrix.T + shift
-        patches = surface.next_to(moved)
+        patches = reference.surface.next_to(moved)
         off, beside = planes.offsets(moved, patches)
         over = beside < planes.WITHIN * patches.width
         weight = np.where(over, planes.tukey(off / (_WIDEST * width)), 0)

@@ -20,7 +20,7 @@ from jaxreg.geometry import arguments, frame, trees
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
-from jaxreg.scans import free_space
+from jaxreg.scans import free_space, planes
 from jaxreg.scans import strays as stray_points
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.search.config import SearchConfig
@@ -114,6 +114,11 @@ class Prepared:
     def tree(self) -> trees.Tree:
         """Over all points."""
         return trees.Tree(self.points)
+
+    @functools.cached_property
+    def surface(self) -> planes.Surface:
+        """Its patches: whatever asks for one finds it again, in this registration and the next."""
+        return planes.Surface(self.points, self.tree)
 
     @functools.cached_property
     def view(self) -> free_space.View | None:

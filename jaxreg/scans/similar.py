@@ -114,7 +114,7 @@ def _one_way(
     narrowest = min(planes.TUKEY * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
     return planes.fitted(
         moving.points[rows] * (moving.radius / unit),
-        planes.Surface(fixed.points, fixed.tree, count=8 if flat else planes.NEIGHBORS, flat=flat),
+        planes.Surface(fixed.points, fixed.tree, count=8, flat=True) if flat else fixed.surface,
         RigidTransform(inner.rotation, inner.translation / unit),
         np.geomspace(_REACH, narrowest, _ITERATIONS),
         motions=np.eye(6)[:, [2, 3, 4]] if flat else known.motions,

@@ -78,7 +78,6 @@ def settled(
     Both are of the centred clouds in the unit of the input, in which points may lie `reach` off.
     """
     unit, motions = reference.radius, known.motions
-    surface = planes.Surface(reference.points, reference.tree)
     finer = planes.Surface(reference.points, reference.tree, count=_NEIGHBORS)
     start = RigidTransform(pose.rotation, pose.translation / unit)
     few, many = _rows(source, _FIRST), _rows(source, _SECOND)
@@ -86,7 +85,9 @@ def settled(
     given = np.ones(len(source.points)) if known.weights is None else known.weights
     noise, least = _noise(source, reference)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
-    found = planes.fitted(first, surface, start, widths, motions=motions, weights=given[few])
+    found = planes.fitted(
+        first, reference.surface, start, widths, motions=motions, weights=given[few]
+    )
     around = trees.neighbors(trees.Tree(second), second, min(_AROUND, len(second)))[1]
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]

@@ -17,16 +17,7 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import chances
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import (
-    candidates,
-    dense,
-    diagnosis,
-    free_space,
-    planes,
-    prepare,
-    stable,
-    verdict,
-)
+from jaxreg.scans import candidates, dense, diagnosis, free_space, prepare, stable, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
@@ -302,11 +293,10 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
     """A sentence if the clouds fit far better at another size, stretched or mirrored."""
     source, reference, config = problem.source, problem.reference, problem.config
     reach = problem.distance * float(problem.where.length)
-    surface = planes.Surface(reference.points, reference.tree)
-    scale, then = dense.at_another_size(source, reference, pose, reach, surface)
+    scale, then = dense.at_another_size(source, reference, pose, reach)
     if told := dense.size_text(scale, now, then):
         return told
-    sizes, then = dense.stretched(source, reference, pose, reach, surface)
+    sizes, then = dense.stretched(source, reference, pose, reach)
     if told := dense.stretch_text(sizes, now, then):
         return told
     mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.scans import dense, planes, prepare
+from jaxreg.scans import dense, prepare
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
@@ -45,10 +45,6 @@ def prepared(points):
     return prepare.prepare(points, config=NARROW)
 
 
-def surface(cloud):
-    return planes.Surface(cloud.points, cloud.tree)
-
-
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))
 
 
@@ -85,7 +81,7 @@ def test_another_size_is_found_from_a_pose_nearby(rng, factor):
     turn = Rotation.from_rotvec([0.01, -0.02, 0.01]).as_matrix()
     start = between(source, reference, RigidTransform(turn, np.full(3, 0.01)))
     now = dense.agreement(source, reference, start)
-    scale, then = dense.at_another_size(source, reference, start, 0.2, surface(reference))
+    scale, then = dense.at_another_size(source, reference, start, 0.2)
     assert scale == pytest.approx(factor, abs=0.003)
     assert dense.size_text(scale, now, then) == f"The source fits at {scale:.3f} of its size."
     assert not dense.size_text(1.001, now, then)
@@ -100,7 +96,7 @@ def test_a_stretch_is_found_from_a_pose_nearby(rng, change):
     source, reference = prepared(stone(rng, 6000)), prepared(stone(rng, 6000) @ change.T)
     start = between(source, reference, IDENTITY)
     now = dense.agreement(source, reference, start)
-    sizes, then = dense.stretched(source, reference, start, 0.2, surface(reference))
+    sizes, then = dense.stretched(source, reference, start, 0.2)
     np.testing.assert_allclose(sizes, np.linalg.svd(change, compute_uv=False), atol=0.006)
     assert then.off < 0.1 * now.off
     told = dense.stretch_text(sizes, now, then)
@@ -114,9 +110,7 @@ def test_a_stretch_that_the_surfaces_do_not_show_is_none(rng):
     """A plate with edges out of sight may be stretched along itself: it stays as it is."""
     clouds = [rng.uniform(-1, 1, (6000, 3)) * [1, 1, 0.002] for _ in range(2)]
     source, reference = map(prepared, clouds)
-    sizes, _ = dense.stretched(
-        source, reference, between(source, reference, IDENTITY), 0.1, surface(reference)
-    )
+    sizes, _ = dense.stretched(source, reference, between(source, reference, IDENTITY), 0.1)
     assert sizes[0] == pytest.approx(1, abs=0.05)
 
 
