@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 CHECKED := jaxreg tests $(wildcard *.py) benchmarks research examples
 CASES ?= ../shared/cases ../shared/cases_jax
+PEERS ?= data/peers
+RIENET := $(wildcard $(PEERS)/rie_modelnet.npz)
 export JAX_PLATFORMS ?= cpu
 
 .PHONY: help demo test coverage slow lint types wheel docs fuzz cases mutants tables figures baselines clean
@@ -24,7 +26,7 @@ coverage: $(VENV)/.installed-dev  ## the same, and which lines they miss (a quar
 slow: $(VENV)/.installed-dev  ## run the tests that `make test` leaves out
 	$(BIN)/python -m pytest -m slow
 
-lint: $(VENV)/.installed-dev  ## style, and the order of imports between the rooms
+lint: $(VENV)/.installed-dev  ## style, and the order of imports between the packages
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/lint-imports
@@ -46,8 +48,9 @@ mutants: $(VENV)/.installed-dev  ## break each kernel on purpose: the tests must
 
 baselines: $(VENV)/.installed-baselines  ## install Open3D, small_gicp and KISS-Matcher for the classical rows
 
-tables: $(VENV)/.installed-baselines  ## figures of the released weights and of the baselines (23 minutes)
-	$(BIN)/python -m benchmarks.paper.tables --jobs 2
+tables: $(VENV)/.installed-baselines  ## the paper's tables: all pairs, then all its methods (40 minutes)
+	$(BIN)/python -m benchmarks.paper.tables --jobs 2 $(RIENET:%=--rienet %)
+	$(BIN)/python -m benchmarks.paper.peers $(and $(RIENET),--folder $(PEERS))
 
 figures: $(VENV)/.installed  ## the pictures of the documentation
 	$(BIN)/python -m benchmarks.figures

@@ -10,11 +10,14 @@ from jax.custom_batching import custom_vmap
 def map_pairs(function: Callable[..., Any]) -> Callable[..., Any]:
     """``jax.vmap(function)``, or on a CPU a loop over the batch.
 
-    One pair fits into the cache; a whole batch would go through main memory once per operation.
+    Arguments by position and by name all have the axis of the batch. One pair fits into the cache; a
+    whole batch would go through main memory once per operation.
     """
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
-    return lambda *batch: jax.lax.map(lambda pair: function(*pair), batch)
+    return lambda *batch, **named: jax.lax.map(
+        lambda pair: function(*pair[0], **pair[1]), (batch, named)
+    )
 
 
 def one_at_a_time(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

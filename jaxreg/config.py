@@ -45,7 +45,7 @@ class ModelConfig:
     coordinates (the paper's ablation without geometric invariants)."""
     angles: Literal["all", "next", "none"] = "next"
     """Pairs (r, s) of the angles in Eq. 7: to every other edge, to the next edge, or no angle. The
-    paper does not say which; `next` withstood outliers better with every seed (RESULTS.md)."""
+    paper does not say which; `next` withstood outliers better with every seed (docs/notes/0009)."""
     inlier_network: Literal["paper", "rienet"] = "paper"
     """Eq. 9-11 as written, or RIENet's convolution along the ordered neighbours."""
     inlier_width: int = 8

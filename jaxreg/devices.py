@@ -44,7 +44,8 @@ def join_processes(
     jax.config.update("jax_enable_recoverability", True)  # or those who are left cannot ask who is
     missing = [option for option, value in known.items() if value is None]
     if len(missing) == len(known):
-        if int(os.environ.get("SLURM_NTASKS", "1")) > 1:
+        # In the shell of an allocation there are tasks to start, and this process is none of them.
+        if "SLURM_PROCID" in os.environ and int(os.environ.get("SLURM_NTASKS", "1")) > 1:
             _initialize()
         return
     if missing:
@@ -79,24 +80,24 @@ def place_of(number: int | None, processes: int | None) -> tuple[int, int]:
     """The number of this process and how many there are, where they need not know each other.
 
     What is not given is read from JAX_PROCESS_ID and JAX_NUM_PROCESSES, or SLURM's variables; else
-    there is one process.
+    there is one process. So it is in the shell of an allocation of SLURM, which is no task of it.
 
     Raises:
       ValueError: one of the two is known and the other is not.
     """
-    known = [
-        os.environ.get(variable, os.environ.get(slurm)) if value is None else value
-        for value, variable, slurm in (
-            (number, "JAX_PROCESS_ID", "SLURM_PROCID"),
-            (processes, "JAX_NUM_PROCESSES", "SLURM_NTASKS"),
-        )
-    ]
-    if None in known and known != [None, None]:
+    asked = os.environ.get
+    rank = asked("JAX_PROCESS_ID", asked("SLURM_PROCID")) if number is None else number
+    count = asked("JAX_NUM_PROCESSES") if processes is None else processes
+    if count is None and rank is not None:
+        count = asked("SLURM_NTASKS")
+    if rank is None and count is None:
+        return 0, 1
+    if rank is None or count is None:
         raise ValueError(
             "one of --processes N and --process-id K is missing: give both, or set "
             "JAX_NUM_PROCESSES and JAX_PROCESS_ID."
         )
-    return (0, 1) if None in known else (int(str(known[0])), int(str(known[1])))
+    return int(rank), int(count)
 
 
 def mesh_of_all() -> Mesh | None:

@@ -7,6 +7,7 @@ the network's code nor its weights, and traces nothing; XLA compiles it for the 
 import dataclasses
 import json
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Bool, Float
 
 from jaxreg import types  # registers the records that programs return
-from jaxreg._extras import extra
-
-with extra("export", "a saved program"):
-    # jax.export needs it, and would say so at its first use only.
-    import flatbuffers  # noqa: F401  # pyright: ignore[reportMissingImports]
-from jax import export
 
 VERSION = 1
 """Of the file: a zip of `card.json` and `program.bin`, the serialised `jax.export.Exported`."""
@@ -31,6 +27,7 @@ GLOBAL = "register_global"
 LEAST, MOST = 256, 2048
 """Points of a cloud that a program with symbolic sizes takes; larger ones are matched in blocks."""
 _CARD, _PROGRAM = "card.json", "program.bin"
+_NO_PROGRAM = "{} is no program of jaxreg: write one by jaxreg export."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +110,9 @@ def export_program(
         a size is below 16.
     """
     platforms = tuple(platforms)
-    if unknown := set(platforms) - {"cpu", "cuda", "rocm", "tpu"} or not platforms:
+    if not platforms:
+        raise ValueError("no platform is given: choose from cpu, cuda, rocm and tpu.")
+    if unknown := set(platforms) - {"cpu", "cuda", "rocm", "tpu"}:
         raise ValueError(f"platforms {unknown}: choose from cpu, cuda, rocm and tpu.")
     if symbolic and name == GLOBAL:
         raise ValueError(
@@ -142,14 +141,10 @@ def load_exported(path: str | Path) -> ExportedProgram:
     """A program that `export_program` wrote; compiled at its first call.
 
     Raises:
-      ValueError: the file is none, was written by a newer jaxreg, or is too old or too new for the
-        JAX at hand.
+      ValueError: there is no such file, it cannot be read, it is no program, was written by a newer
+        jaxreg, or is too old or too new for the JAX at hand.
     """
-    try:
-        with zipfile.ZipFile(path) as file:
-            card, program = json.loads(file.read(_CARD)), file.read(_PROGRAM)
-    except (zipfile.BadZipFile, KeyError, json.JSONDecodeError):
-        raise ValueError(f"{path} is no program of jaxreg: write one by jaxreg export.") from None
+    card, program = _unpacked(path)
     if card["version"] > VERSION:
         raise ValueError(
             f"{path} has version {card['version']} and this jaxreg reads up to {VERSION}: install a "
@@ -161,8 +156,33 @@ def load_exported(path: str | Path) -> ExportedProgram:
         raise ValueError(
             f"{path} cannot be read by JAX {jax.__version__} ({error}): export it again."
         ) from None
-    points = None if card["points"] is None else tuple(card["points"])
-    return ExportedProgram(card["name"], points, tuple(card["platforms"]), call)
+    try:
+        points = None
+        if card["points"] is not None:
+            source, reference = card["points"]
+            points = int(source), int(reference)
+        return ExportedProgram(card["name"], points, tuple(card["platforms"]), call)
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(_NO_PROGRAM.format(path)) from None
+
+
+def _unpacked(path: str | Path) -> tuple[dict[str, Any], bytes]:
+    """The card, which has a version, and the program of a file; raises as `load_exported`."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            card, program = json.loads(file.read(_CARD)), file.read(_PROGRAM)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path.") from None
+    except OSError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}): name a file of jaxreg export."
+        ) from None
+    # A damaged zip raises what it is made of: zlib's errors, encryption, unknown compressions.
+    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, RuntimeError, EOFError):
+        raise ValueError(_NO_PROGRAM.format(path)) from None
+    if not isinstance(card, dict) or not isinstance(card.get("version"), int):
+        raise ValueError(_NO_PROGRAM.format(path))
+    return card, program
 
 
 def _symbols() -> tuple[Any, ...]:

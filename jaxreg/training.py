@@ -82,10 +82,13 @@ def create_train_state(config: Config) -> TrainState:
 def started_from(name: str, state: TrainState) -> TrainState:
     """`state` with released weights, by their name, or the best ones of a run, by its folder.
 
+    Parts that only the training uses are not released (FMR's decoder): they start anew.
+
     Raises:
       ValueError: there are none, or the network of `state` has other arrays.
     """
     variables, trained = load_network(name)
+    variables = by_name.for_training(variables, state.variables, trained)
     there, here = (
         {jax.tree_util.keystr(path, simple=True, separator="/"): x.shape for path, x in leaves}
         for leaves, _ in map(jax.tree_util.tree_flatten_with_path, (variables, state.variables))
@@ -312,6 +315,7 @@ def release(
 ) -> Path:
     """Write the best weights of a run into `directory` (the workdir), with a card of their origin.
 
+    What only the training uses is left out (FMR's decoder); the checkpoint has it.
     The data is named after what is found in `root`, so a stand-in does not pass for the original.
     Returns the path of the card.
 
@@ -342,4 +346,4 @@ def release(
             if key.startswith("val_")
         },
     }
-    return save_weights(directory, name, variables, config, card)
+    return save_weights(directory, name, by_name.for_registration(variables, config), config, card)

@@ -218,4 +218,4 @@ def main(options: Collect | Fit) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Collect | Fit))  # pyright: ignore[reportArgumentType]
+    main(tyro.cli(Collect | Fit, description=__doc__))  # pyright: ignore[reportArgumentType]

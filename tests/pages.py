@@ -26,9 +26,10 @@ def run_python(code: str, names: dict) -> str:
 def run_shell(code: str) -> str | None:
     """What lines `jaxreg ...` and `echo $?` print.
 
-    None for other programs, and for training and evaluation, which take minutes: they are not run.
+    None for other programs, and for training and evaluation of all pairs, which take minutes: they are
+    not run.
     """
-    if not re.match(r"jaxreg (register|align|info|view) ", code):
+    if not re.match(r"jaxreg (register|align|info|view|evaluate \w+ --pairs) ", code):
         return None
     status = 0
     with (

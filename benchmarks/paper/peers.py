@@ -1,13 +1,15 @@
-"""The learned methods of the paper's Table 1, measured here and as the paper prints them.
+"""The paper's whole table: every method of it, measured here and as the paper prints it.
 
-    python -m benchmarks.paper.peers --folder PEERS [--runs idam=RUN fmr=RUN] [--hours idam=3.5] [--pairs 64]
+    python -m benchmarks.paper.peers [--folder PEERS] [--hours idam=1.2] [--runs fmr=RUN] [--pairs 64]
 
-PEERS holds the arrays of the authors' state dicts (cemnet_*.npz, dcp_v1.npz, rie_modelnet.npz); RUN is
-the workdir of a training (`python train.py configs/peer_idam_unseen_objects.toml --workdir RUN`), whose
-best checkpoint is measured. The same first pairs for every method: the paper's three columns, and pairs
-that are jittered, resampled or cropped, with rotations up to 45 degrees an axis and with any rotation.
-A method without weights has a row of what the paper prints; one that was trained here says for how long,
-beside the budget of its authors. A log has no times: `--hours` are those of the training, by its clock.
+The same first pairs for every method: the paper's three columns, its scans (or what stands in for
+them), and pairs that are jittered, resampled or cropped, with rotations up to 45 degrees an axis and
+with any rotation. PEERS holds the arrays of the authors' state dicts (cemnet_*.npz, dcp_v1.npz,
+rie_modelnet.npz). IDAM, RPM-Net and FMR are measured with the weights that come with jaxreg, or with the
+best checkpoint of a run (`jaxreg train peer_idam_unseen_objects --workdir RUN`); their rows say how long
+they were trained, beside the budget of their authors. A card has no times: `--hours` are those of the
+training, by its clock. A method without weights, or whose library is not installed, has a row of what
+the paper prints.
 """
 
 import dataclasses
@@ -18,7 +20,7 @@ from typing import NamedTuple
 import tyro
 
 from benchmarks import record, render
-from benchmarks.paper.columns import CONFIGS
+from benchmarks.paper import columns, printed, tables
 from jaxreg.cli.process import enable_compilation_cache
 from jaxreg.config import Config, load_config
 from jaxreg.data import data_root
@@ -26,42 +28,59 @@ from jaxreg.evaluation import score
 from jaxreg.io.log import read_metrics
 from jaxreg.peers import by_name
 from jaxreg.weights.checkpoint import best_config
+from jaxreg.weights.released import available_weights, load_card
 
 
 class Column(NamedTuple):
-    """A set of test pairs: a file in configs/, its name on the page, whether any rotation is drawn."""
+    """A set of test pairs: its name on the page, and where it comes from.
 
-    config: str
+    `of_paper` is one of `benchmarks.paper.columns`; without it `config` is a file in configs/, of which
+    any rotation is drawn if `any_rotation`.
+    """
+
     label: str
+    of_paper: str = ""
+    config: str = ""
     any_rotation: bool = False
 
 
+_PAPER = {
+    "clean": "unseen_objects",
+    "categories": "unseen_categories",
+    "noise": "gaussian_noise",
+    "scenes": "seven_scenes",
+    "icl": "icl_nuim",
+}
 _KINDS = {
-    "jitter": Column("modelnet40_jitter", "jitter 0.01"),
-    "resampled": Column("modelnet40_resampled", "no shared point"),
-    "crops": Column("modelnet40_crops70", "crops of 70 %, no shared point"),
+    "jitter": Column("jitter 0.01", config="modelnet40_jitter"),
+    "resampled": Column("no shared point", config="modelnet40_resampled"),
+    "crops": Column("crops of 70 %, no shared point", config="modelnet40_crops70"),
 }
 COLUMNS = (
     {
-        "clean": Column("modelnet40_unseen_objects", "unseen objects"),
-        "categories": Column("modelnet40_unseen_categories", "unseen categories"),
-        "noise": Column("modelnet40_gaussian_noise", "Gaussian noise"),
+        key: Column(columns.COLUMNS[name].label.partition(",")[0], of_paper=name)
+        for key, name in _PAPER.items()
     }
     | _KINDS
     | {
-        f"{key}_any": Column(x.config, f"{x.label}, any rotation", any_rotation=True)
+        f"{key}_any": x._replace(label=f"{x.label}, any rotation", any_rotation=True)
         for key, x in _KINDS.items()
     }
 )
-CEMNET = "cemnet:{folder}/cemnet_modelnet40_n768_unseen{unseen}_noise{noise}.npz"
 METHODS = {
-    "cemnet": "CEMNet, its authors' weights",
-    "dcp": "DCP v1, its authors' weights",
-    "rienet": "RIENet, its authors' weights",
+    "open3d_icp": "ICP (Open3D)",
+    "open3d_fgr": "FGR (Open3D)",
+    "open3d_ransac": "FPFH + RANSAC (Open3D)",
     "idam": "IDAM",
     "rpmnet": "RPM-Net",
     "fmr": "FMR",
+    "cemnet": "CEMNet, its authors' weights",
+    "rienet": "RIENet, its authors' weights",
+    "jaxreg": "the paper's network (jaxreg)",
+    "dcp": "DCP v1, its authors' weights",
+    "register_global": "`register_global` (jaxreg)",
 }
+"""The nine rows of the paper's table in its order, and two more."""
 TRAINABLE = tuple(name for name in by_name.TRAINED if name in METHODS)
 BUDGETS = {
     "idam": "40 epochs, 16 pairs a step",
@@ -69,30 +88,6 @@ BUDGETS = {
     "fmr": "200 epochs, 8 pairs a step",
 }
 """How long their authors train them."""
-PUBLISHED = {
-    "clean": {
-        "idam": (0.4243, 0.0020, 0.8170, 0.0040),
-        "rpmnet": (0.0051, 0.0000, 0.0201, 0.0000),
-        "fmr": (3.6497, 0.0101, 7.2810, 0.0200),
-        "cemnet": (0.1385, 0.0001, 0.2489, 0.0002),
-        "rienet": (0.0033, 0.0000, 0.0210, 0.0000),
-    },
-    "categories": {
-        "idam": (0.4809, 0.0028, 0.9157, 0.0055),
-        "rpmnet": (0.0064, 0.0001, 0.0207, 0.0001),
-        "fmr": (3.8594, 0.0114, 7.6450, 0.0225),
-        "cemnet": (0.0804, 0.0002, 0.1405, 0.0003),
-        "rienet": (0.0059, 0.0000, 0.0228, 0.0001),
-    },
-    "noise": {
-        "idam": (2.3076, 0.0124, 4.5332, 0.0246),
-        "rpmnet": (0.0075, 0.0000, 0.0221, 0.0001),
-        "fmr": (18.0355, 0.0536, 35.7986, 0.1063),
-        "cemnet": (10.7026, 0.0393, 21.1836, 0.0781),
-        "rienet": (0.0069, 0.0001, 0.0230, 0.0001),
-    },
-}
-"""MAE(R), MAE(t), MIE(R) and MIE(t) of the paper's Table 1, over all pairs; degrees."""
 FIGURES = {
     "mae_r": ("mae_r_deg", "MAE(R)"),
     "mae_t": ("mae_t", "MAE(t)"),
@@ -106,17 +101,18 @@ FIGURES = {
 }
 """Columns of the record, the metrics that fill them, and their heads; `mean` is MIE(R)."""
 PAPER_HEADS = {"mae_r": "MAE(R)", "mae_t": "MAE(t)", "mean": "MIE(R)", "mie_t": "MIE(t)"}
-"""What the paper prints, by the names of our columns and its own."""
+"""What the paper prints, by the names of our columns and its own, in the order of `printed.Errors`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What to evaluate."""
 
-    folder: str
-    """Folder of the NPZ files."""
+    folder: str = ""
+    """Folder of the authors' NPZ files."""
     runs: tuple[str, ...] = ()
-    """Trainings to measure, NAME=WORKDIR with one of the names idam, rpmnet, fmr."""
+    """Trainings to measure in place of the weights that come with jaxreg, NAME=WORKDIR with one of the
+    names idam, rpmnet, fmr."""
     hours: tuple[str, ...] = ()
     """Hours that a training took, NAME=HOURS."""
     pairs: int = 64
@@ -148,34 +144,50 @@ def named(given: Sequence[str], option: str) -> dict[str, str]:
 
 def name_of(method: str, column: str, folder: str, runs: dict[str, str]) -> str:
     """The method as `methods.choose` takes it; empty where there are no weights."""
-    if method in runs:
-        return f"checkpoint:{runs[method]}"
-    # CEMNet has weights of their own for jittered clouds and for unseen categories.
-    noise, unseen = int(column.startswith("jitter")), int(column == "categories")
-    return {
-        "cemnet": CEMNET.format(folder=folder, noise=noise, unseen=unseen),
-        "dcp": f"dcp:{folder}/dcp_v1.npz",
-        "rienet": f"rienet:{folder}/rie_modelnet.npz",
-    }.get(method, "")
+    if method in TRAINABLE:
+        own = f"weights:{method}" if method in available_weights() else ""
+        return f"checkpoint:{runs[method]}" if method in runs else own
+    if method in ("cemnet", "rienet", "dcp"):
+        file = f"{folder}/{_authors_file(method, column)}"
+        return f"{method}:{file}" if folder else ""
+    if method == "jaxreg":
+        of_column = {"categories": "modelnet40_first20"}
+        return f"weights:{of_column.get(column, 'modelnet40')}"
+    return columns.BASELINES.get(method, method)
 
 
-def trained(method: str, workdir: str, hours: str | None) -> dict[str, record.Value]:
-    """The label and the budget of a row that was trained here.
+def _authors_file(method: str, column: str) -> str:
+    """CEMNet has weights of their own for jittered clouds, unseen categories, and both kinds of scans."""
+    if method != "cemnet":
+        return {"rienet": "rie_modelnet.npz", "dcp": "dcp_v1.npz"}[method]
+    data = {"scenes": "scene7", "icl": "icl_nuim"}.get(column, "modelnet40")
+    unseen, noise = int(column == "categories"), int(column.startswith("jitter"))
+    return f"cemnet_{data}_n768_unseen{unseen}_noise{noise}.npz"
+
+
+def trained(method: str, runs: dict[str, str], hours: str | None) -> dict[str, record.Value]:
+    """The label and the budget of a row that was trained here: a run, or weights with their card.
 
     Raises:
-      ValueError: there is no checkpoint in `workdir`, or one of another network.
+      ValueError: there is no checkpoint in the folder of the run, or one of another network.
     """
-    config = best_config(workdir)[0]
-    if config.network != method:
-        raise ValueError(f"--runs {method}={workdir}: that is a run of {config.network}.")
-    steps = int(read_metrics(Path(workdir) / "metrics.jsonl")["step"][-1])
+    if method in runs:
+        config = best_config(runs[method])[0]
+        steps = int(read_metrics(Path(runs[method]) / "metrics.jsonl")["step"][-1])
+        if config.network != method:
+            raise ValueError(f"--runs {method}={runs[method]}: that is a run of {config.network}.")
+        batch, categories = config.train.batch, config.data.train_categories
+    else:
+        setting = load_card(method)["config"]
+        steps, batch = setting["train"]["steps"], setting["train"]["batch"]
+        categories = setting["data"]["train_categories"]
     time = f", {float(hours):.3g} h" if hours else ""
     return {
-        "label": f"{METHODS[method]}, trained here: {steps} steps of {config.train.batch} pairs{time}",
+        "label": f"{METHODS[method]}, trained here: {steps} steps of {batch} pairs{time}",
         "steps": steps,
-        "pairs_seen": steps * config.train.batch,
+        "pairs_seen": steps * batch,
         "hours": float(hours) if hours else None,
-        "trained_on": config.data.train_categories,
+        "trained_on": categories,
     }
 
 
@@ -185,10 +197,10 @@ def row_of(method: str, options: Options) -> dict[str, record.Value]:
     row: dict[str, record.Value] = {"label": METHODS[method]}
     if method in BUDGETS:
         row = {"label": f"{METHODS[method]}, not trained here", "budget": BUDGETS[method]}
-    if method in runs:
-        row |= trained(method, runs[method], hours.get(method))
+    if method in TRAINABLE and name_of(method, "clean", "", runs):
+        row |= trained(method, runs, hours.get(method))
     for column in options.only:
-        found = PUBLISHED.get(column, {}).get(method)
+        found = printed.TABLES.get(COLUMNS[column].of_paper, {}).get(method)
         if found:
             row |= {paper_key(column, k): x for k, x in zip(PAPER_HEADS, found, strict=True)}
     return row
@@ -200,10 +212,13 @@ def paper_key(column: str, figure: str) -> str:
     return name if column == "clean" else f"{column}_{name}"
 
 
-def column_config(column: str) -> Config:
+def column_config(column: str, root: Path | None) -> Config:
     """The pairs of a column; every network solves its Procrustes as its paper does."""
     chosen = COLUMNS[column]
-    config = load_config(CONFIGS / f"{chosen.config}.toml")
+    if chosen.of_paper:
+        config = tables.column_config(columns.COLUMNS[chosen.of_paper], root)
+    else:
+        config = load_config(columns.CONFIGS / f"{chosen.config}.toml")
     pairs = config.test_pairs
     if chosen.any_rotation:
         pairs = dataclasses.replace(pairs, rotation="full")
@@ -216,7 +231,12 @@ def measure(method: str, column: str, options: Options, root: Path | None) -> di
     name = name_of(method, column, options.folder, named(options.runs, "runs"))
     if not name or method not in options.methods:
         return {}
-    scored = score.evaluate(column_config(column), root=root, method=name, pairs=options.pairs)
+    config = column_config(column, root)
+    try:
+        scored = score.evaluate(config, root=root, method=name, pairs=options.pairs)
+    except ValueError as error:  # Weights, data or a library that are not there.
+        print(f"{method}, {COLUMNS[column].label}: left out: {error}", flush=True)
+        return {}
     found = score.figures(scored)
     cell = {f"{column}_{key}": found[metric] for key, (metric, _) in FIGURES.items()}
     cell[f"{column}_ms"] = 1e3 * found["seconds_per_pair"]
@@ -227,9 +247,9 @@ def measure(method: str, column: str, options: Options, root: Path | None) -> di
 def heads_of(column: str) -> dict[str, str]:
     """The record's columns of a set of pairs: what the paper prints, if it does, and what was measured."""
     heads = {key: head for key, (_, head) in FIGURES.items()}
-    printed = {paper_key(column, key): f"paper's {PAPER_HEADS[key]}" for key in PAPER_HEADS}
+    of_paper = {paper_key(column, key): f"paper's {PAPER_HEADS[key]}" for key in PAPER_HEADS}
     found = {f"{column}_{key}": head for key, head in heads.items()}
-    return (printed if column in PUBLISHED else {}) | found | {f"{column}_ms": "ms a pair"}
+    return (of_paper if COLUMNS[column].of_paper else {}) | found | {f"{column}_ms": "ms a pair"}
 
 
 def columns_of(options: Options) -> dict[str, str]:
@@ -251,11 +271,11 @@ def write(rows: dict[str, dict], options: Options) -> Path:
     """The record `peers`: a row a method."""
     return record.write(
         "peers",
-        question="What do the learned methods of the paper's table reach here?",
+        question="What does the paper's whole table look like here?",
         command=record.command("benchmarks.paper.peers"),
         columns=columns_of(options),
         rows=rows,
-        setting={"pairs": options.pairs, "trained": len(options.runs)},
+        setting={"pairs": options.pairs},
     )
 
 
@@ -269,7 +289,7 @@ def show(rows: dict[str, dict], options: Options) -> None:
 def main(options: Options) -> None:
     """Evaluate all, print and write the table."""
     enable_compilation_cache()
-    root = data_root(options.data_root, CONFIGS / "any.toml")
+    root = data_root(options.data_root, columns.CONFIGS / "any.toml")
     rows = {method: row_of(method, options) for method in METHODS}
     for column in options.only:
         for method in METHODS:

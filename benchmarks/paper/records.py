@@ -6,13 +6,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks import record
+from benchmarks.paper import printed
 from benchmarks.paper.columns import (
     BASELINES,
     COLUMNS,
     CONFIGS,
     NETWORK,
     PAPER,
-    PAPER_OF_OTHERS,
     ROBUST_ROUNDS,
 )
 from jaxreg.config import load_config
@@ -155,7 +155,8 @@ def write_others(cells: Cells, some_pairs: int) -> Path:
                     f"{kind}_recall": cell["recall_1deg"],
                     f"{kind}_ms": 1e3 * cell["seconds_per_pair"],
                 }
-            table[key][f"{kind}_paper"] = PAPER_OF_OTHERS[name].get(key)
+            paper = printed.TABLES[name].get(key)
+            table[key][f"{kind}_paper"] = paper.mae_r if paper else None
     heads = {"mae_r": "MAE(R)", "worst": "worst", "recall": "recall 1 deg", "ms": "ms a pair"}
     heads["paper"] = "paper's MAE(R)"
     names = {"clean": "unseen objects", "noise": "Gaussian noise"}

@@ -117,15 +117,16 @@ def write(steps: Steps, options: Options) -> Path:
         key, label = key_and_label(curve, hardness)
         rows.setdefault(key, {"label": label})
         rows[key] |= {f"{column_key(name)}_{d}deg": found.recall(d) for d in (5, 1)}
+        rows[key][f"{column_key(name)}_ms"] = float(np.median(found.milliseconds))
     kept = int(np.sum(~next(iter(steps.values())).symmetric))
     return record.write(
         "curves",
         question="And as they become harder, beside the classical pipelines?",
         command=record.command("benchmarks.scans.curves"),
         columns={
-            f"{column_key(name)}_{d}deg": f"{LABELS.get(name, name)}: {d} deg"
+            f"{column_key(name)}_{figure}": f"{LABELS.get(name, name)}: {head}"
             for name in options.methods
-            for d in (5, 1)
+            for figure, head in (("5deg", "5 deg"), ("1deg", "1 deg"), ("ms", "processor ms"))
         },
         rows=rows,
         setting={"pairs": options.pairs, "kept": kept},

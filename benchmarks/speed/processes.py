@@ -10,9 +10,10 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,6 +32,42 @@ def peak_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
+class Finished(NamedTuple):
+    """What a process wrote on its standard output, and how long it took by the clock."""
+
+    output: str
+    seconds: float
+
+
+def finished(
+    command: Sequence[str],
+    *,
+    environment: Mapping[str, str],
+    given: str = "",
+    folder: Path | None = None,
+) -> Finished:
+    """A command from its start to its end, with the text `given` on its standard input.
+
+    Raises:
+      RuntimeError: the process failed; the message ends with what it wrote.
+    """
+    begin = time.perf_counter()
+    process = subprocess.run(
+        command,
+        input=given,
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=environment,
+        check=False,
+    )
+    seconds = time.perf_counter() - begin
+    if process.returncode:
+        wrote = (process.stdout + process.stderr)[-2000:]
+        raise RuntimeError(f"{' '.join(command)} failed with {given or 'no input'}:\n{wrote}")
+    return Finished(process.stdout, seconds)
+
+
 def run(task: str, *, cache: str = "", huge_pages: bool = False, **options) -> dict:
     """The findings of a fresh process.
 
@@ -46,20 +83,9 @@ def run(task: str, *, cache: str = "", huge_pages: bool = False, **options) -> d
         environment["XDG_CACHE_HOME"] = cache
     if huge_pages:
         environment["GLIBC_TUNABLES"] = "glibc.malloc.hugetlb=1"
-    begin = time.perf_counter()
-    process = subprocess.run(
-        [sys.executable, "-m", "benchmarks.speed.processes", task],
-        input=json.dumps(options),
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=environment,
-        check=False,
-    )
-    seconds = time.perf_counter() - begin
-    if process.returncode:
-        raise RuntimeError(f"{task} {options} failed:\n{process.stderr[-2000:]}")
-    return json.loads(process.stdout.splitlines()[-1]) | {"process_s": seconds}
+    command = [sys.executable, "-m", "benchmarks.speed.processes", task]
+    done = finished(command, environment=environment, given=json.dumps(options), folder=ROOT)
+    return json.loads(done.output.splitlines()[-1]) | {"process_s": done.seconds}
 
 
 def first_results(task: str, **options) -> tuple[dict, dict]:
@@ -94,7 +120,7 @@ def register_pair(points: int) -> dict:
 
 
 def register(points: int) -> dict:
-    """First result of `jaxreg.register`, as the command line tool has it."""
+    """First result of `jaxreg.register` on two crops of a procedural shape, with the tool's cache."""
     begin = time.perf_counter()
     import numpy as np
 
@@ -103,7 +129,8 @@ def register(points: int) -> dict:
 
     process.enable_compilation_cache()
     imported = time.perf_counter()
-    cloud = np.random.default_rng(0).uniform(-0.5, 0.5, (points, 3)) * [1, 0.7, 0.5]
+    cloud = jaxreg.sample_shape(0, 7, points=points)
+    cloud = cloud[np.argsort(cloud[:, 0])]
     jaxreg.register(cloud[: 3 * points // 4], cloud[points // 4 :] + 0.1)
     return {"import_s": imported - begin, "result_s": time.perf_counter() - imported}
 

@@ -108,7 +108,7 @@ def speed(results: dict[str, list], options) -> Path:
         task = row["first result"].removeprefix("jaxreg.")
         cache = {"empty": "cold"}.get(row["cache"], row["cache"])
         setting[f"{task}_{cache}_s"] = round(row["process, s"], 1)
-    columns = {"ms": "ms a pair", "faster": "times faster than as first written"}
+    columns = {"ms": "ms a pair", "faster": "times faster than the equations as they stand"}
     return _write("speed", "How fast is the network?", columns, rows, setting)
 
 

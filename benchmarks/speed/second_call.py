@@ -12,7 +12,6 @@ ten calls on each pair. Ratios are within a round. By the clock, since all use a
 import dataclasses
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -83,16 +82,10 @@ def seconds(kind: str, path: Path, root: Path) -> list[float]:
       RuntimeError: the process failed; the message ends with what it wrote.
     """
     script = Path(__file__).with_name("calls.py")
-    process = subprocess.run(
-        [sys.executable, "-P", str(script), kind, str(path)],
-        env=os.environ | {"PYTHONPATH": str(root.resolve())},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if process.returncode:
-        raise RuntimeError(f"{kind} of {root} failed:\n{process.stderr[-2000:]}")
-    return json.loads(process.stdout.splitlines()[-1])
+    command = [sys.executable, "-P", str(script), kind, str(path)]
+    environment = os.environ | {"PYTHONPATH": str(root.resolve())}
+    done = processes.finished(command, environment=environment)
+    return json.loads(done.output.splitlines()[-1])
 
 
 def rows(taken: dict[str, list[list[float]]]) -> dict[str, dict[str, str | float]]:

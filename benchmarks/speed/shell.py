@@ -10,10 +10,8 @@ and the script (benchmarks/speed/open3d_script.py) take turns. By the clock.
 import dataclasses
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from benchmarks import record
+from benchmarks.speed import processes
 from jaxreg.data.procedural import shapes
 from jaxreg.io.writing import write_cloud
 
@@ -62,18 +61,8 @@ def seconds(command: list[str], cache: Path) -> float:
     Raises:
       RuntimeError: it failed; the message ends with what it wrote.
     """
-    begin = time.perf_counter()
-    done = subprocess.run(
-        command,
-        env=os.environ | {"XDG_CACHE_HOME": str(cache)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    taken = time.perf_counter() - begin
-    if done.returncode:
-        raise RuntimeError(f"{command} failed:\n{(done.stdout + done.stderr)[-2000:]}")
-    return taken
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    return processes.finished(command, environment=environment).seconds
 
 
 def row(label: str, taken: list[float]) -> dict[str, str | float | int]:

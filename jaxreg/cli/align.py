@@ -42,7 +42,8 @@ class Align:
     """The clouds, two or more: any formats that `jaxreg register` reads."""
     output: Output = None
     """Write the merged cloud here (PLY: with a property `scan`, and the colours that came with the
-    scans; other formats: points). Of several groups each has its own file, numbered."""
+    scans; other formats: points). Of several groups each has its own file, numbered; the last lines say
+    which."""
     poses: OptionalPath = None
     """Write the poses, scan to common frame, to this file: .json, .txt (4x4), .tum, .kitti or .g2o."""
     json: OptionalPath = None
@@ -111,13 +112,13 @@ class Align:
                 progress=progress,
             )
         seconds = time.perf_counter() - begin
-        written: list[Path] = []
+        written: list[tuple[str, str]] = []
         try:  # Written first: a reader that closes the pipe, as `head` does, ends this process.
-            written = _write(self, scans, alignment)
+            _write(self, scans, alignment, written)
         finally:
             _print(self, scans, alignment, seconds)
-        for path in written:
-            line("wrote", str(path))
+        for name, told in written:
+            line(name, told)
         return SUCCESS if alignment.success else NOT_TRUSTED
 
 
@@ -148,25 +149,41 @@ def _check(command: Align) -> None:
         io.check_poses_output(command.poses)
     if command.plot:
         check_picture(command.plot)
-    taken = [*command.scans, *filter(None, [command.initial, command.times])]
-    outputs = (command.output, command.poses, command.json, command.html, command.plot)
-    for path in filter(None, outputs):
+    taken = _inputs(command)
+    for path in _outputs(command):
         io.check_place(path, taken)
         taken.append(path)
 
 
-def _write(command: Align, scans: list["Scan"], alignment: "Alignment") -> list[Path]:
-    """Write what is asked for; returns the paths."""
+def _inputs(command: Align) -> list[Path]:
+    return [*command.scans, *filter(None, [command.initial, command.times])]
+
+
+def _outputs(command: Align) -> list[Path]:
+    """The files to write, of the groups the first alone: how many there are is known at the end."""
+    files = (command.output, command.poses, command.json, command.html, command.plot)
+    return [path for path in files if path]
+
+
+def _write(
+    command: Align, scans: list["Scan"], alignment: "Alignment", told: list[tuple[str, str]]
+) -> None:
+    """Write what is asked for; `told` gets lines on it, a name and a text."""
     from jaxreg import io
     from jaxreg.scans import alignment_summary as summary
     from jaxreg.view import alignment_page
 
     clouds = [scan.points for scan in scans]
     names = [str(path) for path in command.scans]
-    written = _write_merged(command, clouds, alignment) if command.output else []
+    if command.output:
+        _write_merged(command, command.output, clouds, alignment, told)
+
+    def write_poses(path: Path) -> None:
+        edges = summary.edges(alignment) if path.suffix.lower() == ".g2o" else None
+        io.write_poses(path, alignment.transformation, names=names, edges=edges)
+
     writers = (
-        (command.poses, lambda path: io.write_poses(
-            path, alignment.transformation, names=names, edges=summary.edges(alignment))),
+        (command.poses, write_poses),
         (command.json, lambda path: path.write_text(
             json.dumps(summary.record(alignment, names), indent=1, allow_nan=False) + "\n",
             "utf-8")),
@@ -179,18 +196,22 @@ def _write(command: Align, scans: list["Scan"], alignment: "Alignment") -> list[
         if path is not None:
             with io.whole(path) as part:
                 write(part)
-            written.append(path)
-    return written
+            told.append(("wrote", str(path)))
 
 
-def _write_merged(command: Align, clouds: list[np.ndarray], alignment: "Alignment") -> list[Path]:
+def _write_merged(
+    command: Align,
+    output: Path,
+    clouds: list[np.ndarray],
+    alignment: "Alignment",
+    told: list[tuple[str, str]],
+) -> None:
     from jaxreg import io
 
-    assert command.output is not None
-    paths = []
-    for k in range(len(alignment.groups)):
-        output = command.output
-        path = output if k == 0 else output.with_name(f"{output.stem}.{k + 1}{output.suffix}")
+    if not alignment.groups:
+        told.append(("not written", f"{output}: no two scans hang together"))
+    paths = _group_paths(command, output, len(alignment.groups))
+    for k, path in enumerate(paths):
         points, scan = alignment.merged(clouds, group=k, voxel=command.voxel)
         colors = None
         if command.voxel is None:
@@ -200,8 +221,21 @@ def _write_merged(command: Align, clouds: list[np.ndarray], alignment: "Alignmen
             )
         with io.whole(path) as part:
             io.write_merged(part, points, scan, colors)
-        paths.append(path)
-    return paths
+        which = f" (group {k + 1})" if len(paths) > 1 else ""
+        told.append(("wrote", f"{path}{which}"))
+
+
+def _group_paths(command: Align, output: Path, count: int) -> list[Path]:
+    """The file of every group: OUT, OUT.2 and so on, without names that are read or written."""
+    taken = {path.resolve() for path in (*_inputs(command), *_outputs(command))}
+    paths, number = [output], 1
+    while len(paths) < count:
+        number += 1
+        path = output.with_name(f"{output.stem}.{number}{output.suffix}")
+        # It is too late to refuse it: the work is done.
+        if path.resolve() not in taken and not path.is_dir():
+            paths.append(path)
+    return paths[:count]
 
 
 def _print(command: Align, scans: list["Scan"], alignment: "Alignment", seconds: float) -> None:

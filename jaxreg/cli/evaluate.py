@@ -24,6 +24,7 @@ from jaxreg.data import root_of
 from jaxreg.evaluation import methods, score
 from jaxreg.evaluation.parts import Parts
 from jaxreg.evaluation.table import results_table
+from jaxreg.weights.released import weight_files
 
 _SUFFIXES = {
     "json": (),
@@ -73,7 +74,8 @@ class Options:
     save_transforms: str = ""
     """Write the predicted transforms to this NPZ file."""
     data_root: str = ""
-    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to your
+    configuration, or in the working directory for one that comes with jaxreg)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -117,9 +119,8 @@ def _run(options: Options, path: Path, given: Collection[str]) -> int:
 
 def _parts(options: Options) -> Parts | None:
     """The share of this process, or None if there is one process and no folder."""
-    number, processes = devices.place_of(options.process_id, options.processes)
     if options.parts:
-        return Parts(Path(options.parts), number, processes)
+        return Parts(Path(options.parts), *devices.place_of(options.process_id, options.processes))
     if options.processes is not None or options.process_id is not None:
         raise ValueError("--processes and --process-id need a folder that all share: give --parts.")
     return None
@@ -146,8 +147,7 @@ def _check(options: Options, path: Path) -> None:
             f"--pairs {options.pairs} --batch {options.batch}: give --pairs 0 (all) or more, and "
             "--batch 1 or more."
         )
-    weights = options.method.partition(":")[2]  # of a peer, as in cemnet:FILE
-    taken = [path, *(Path(p) for p in (options.transforms, options.rienet, weights) if p)]
+    taken = [path, *_inputs(options)]
     for name, suffixes in _SUFFIXES.items():
         if getattr(options, name):
             output = Path(getattr(options, name))
@@ -157,7 +157,33 @@ def _check(options: Options, path: Path) -> None:
                     f"{' or '.join(suffixes)}."
                 )
             io.check_place(output, taken)
+            _check_not_among(output, options)
             taken.append(output)
+
+
+def _inputs(options: Options) -> list[Path]:
+    """The files of the method that is evaluated."""
+    kind, _, place = options.method.partition(":")  # as in cemnet:FILE
+    weights = place if kind == "weights" else ""
+    if not (options.method or options.transforms or options.checkpoint or options.rienet):
+        weights = options.config.weights
+    files = [Path(p) for p in (options.transforms, options.rienet, place) if p]
+    return [*files, *(weight_files(weights) if weights else ())]
+
+
+def _check_not_among(output: Path, options: Options) -> None:
+    """Raise ValueError if a folder that is read would hold the output as one of its own files."""
+    own, data = False, options.config.data
+    if options.parts:
+        own = Parts(Path(options.parts)).keeps(output)
+    if data.name == "folder" and data.folder and output.suffix.lower() in io.READABLE:
+        own |= output.resolve().is_relative_to(Path(data.folder).resolve())
+    if options.checkpoint:
+        own |= output.resolve().is_relative_to((Path(options.checkpoint) / "best").resolve())
+    if own:
+        raise ValueError(
+            f"{output} is among the files that this command reads: choose another folder or name."
+        )
 
 
 def _as_trained(options: Options, path: Path, given: Collection[str], method: str) -> Config:
@@ -189,7 +215,8 @@ def _report(options: Options, path: Path, scored: score.Scored) -> None:
     if options.transforms and (hint := score.other_convention(scored)):
         say(hint)
     if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        with io.whole(Path(options.json)) as part:
+            part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def _write(options: Options, config: Config, root: Path | None, scored: score.Scored) -> None:

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from jaxreg.cli import process
 from jaxreg.cli.options import NOT_TRUSTED, SUCCESS, complain, line, say
+from jaxreg.refine.config import RefineConfig
 from jaxreg.scans.config import RegisterConfig
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class Register:
             line("wrote", str(path))
         for note in lost:
             line("note", note)
-        for hint in _hints(source, reference, success=result.success):
+        for hint in _hints(source, reference, result):
             line("hint", hint)
         if not result.success:
             line("hint", _HINT if self.initial else _HINT + _START)
@@ -169,12 +170,18 @@ def _stable(told: str, reference: np.ndarray) -> np.ndarray:
     from jaxreg import io
     from jaxreg.scans import masks
 
-    numbers = told.replace(",", " ").split()
-    try:
-        box = [float(word) for word in numbers]
-    except ValueError:
+    box = _box(told)
+    if box is None:
         return io.read_numbers(Path(told), len(reference)) != 0
     return masks.in_box(reference, box)
+
+
+def _box(told: str) -> list[float] | None:
+    """The numbers of --stable; None if it names a file."""
+    try:
+        return [float(word) for word in told.replace(",", " ").split()]
+    except ValueError:
+        return None
 
 
 def _print_result(
@@ -196,15 +203,16 @@ def _print_result(
         line("reason", result.reason)
 
 
-def _hints(source: np.ndarray, reference: np.ndarray, *, success: bool) -> list[str]:
-    """What is odd about the clouds; of a success only that their sizes differ."""
+def _hints(source: np.ndarray, reference: np.ndarray, result: "ScanRegistration") -> list[str]:
+    """What is odd about the clouds; of a success only that their sizes differ, at the scale found."""
     from jaxreg.scans import diagnosis
 
     clouds = {"source": source, "reference": reference}
     clouds = {name: p[np.isfinite(p).all(axis=1)] for name, p in clouds.items()}
-    least = 1.2 if success else 1.1
-    hints = diagnosis.compared(clouds["source"], clouds["reference"], least=least)
-    if not success:
+    least = 1.2 if result.success else 1.1
+    sized = clouds["source"] * result.scale
+    hints = diagnosis.compared(sized, clouds["reference"], least=least)
+    if not result.success:
         for name, points in clouds.items():
             hints += [f"the {name}: {told}" for told in diagnosis.findings(points)]
     return hints
@@ -229,7 +237,8 @@ def _check_outputs(command: Register) -> None:
         io.check_output(command.output, command.source)
     if command.plot:
         check_picture(command.plot)
-    taken = [command.source, command.reference, *filter(None, [command.initial])]
+    stable = Path(command.stable) if command.stable and _box(command.stable) is None else None
+    taken = [command.source, command.reference, *filter(None, [command.initial, stable])]
     for path in _outputs(command):
         io.check_place(path, taken)
         taken.append(path)
@@ -259,12 +268,17 @@ def check_columns(paths: Sequence[Path], scans: Sequence["Scan"]) -> None:
 
     named = list(zip(paths, scans, strict=True))
     flat = next((path for path, scan in named if TWO_COLUMNS in scan.notes), None)
-    tall = next((path for path, scan in named if np.ptp(scan.points[:, 2]) > 0), None)
+    tall = next((path for path, scan in named if _has_height(scan.points)), None)
     if flat is not None and tall is not None:
         raise ValueError(
             f"{flat} has two columns, x and y, and {tall} has three: give all in the plane, or all "
             "in space."
         )
+
+
+def _has_height(points: np.ndarray) -> bool:
+    height = points[np.isfinite(points).all(axis=1), 2]
+    return len(height) > 0 and np.ptp(height) > 0
 
 
 def _write_results(
@@ -278,14 +292,12 @@ def _write_results(
     from jaxreg import io
     from jaxreg.view import page
 
-    shown = source * result.scale
-
     def write_page(path: Path) -> None:
         names = (command.source.name, command.reference.name)
-        page.write_registration_page(path, shown, reference, result, names=names)
+        page.write_registration_page(path, source, reference, result, names=names)
 
     def draw(path: Path) -> None:
-        page.draw_registration(path, shown, reference, result)
+        page.draw_registration(path, source, reference, result)
 
     def write_moved(path: Path) -> None:
         moved = (result.scale * result.rotation, result.translation)

@@ -44,7 +44,8 @@ class Options:
     process_id: int | None = None
     """The number of this process, from 0."""
     data_root: str = ""
-    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to the configuration)."""
+    """Folder of the data sets (if left out $JAXREG_DATA, then data/ next to your
+    configuration, or in the working directory for one that comes with jaxreg)."""
 
 
 def main(arguments: list[str] | None = None) -> int:

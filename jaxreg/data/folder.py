@@ -62,7 +62,7 @@ def split_files(
 def _files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}: name yours with --data.folder.")
-    files = [path for path in folder.rglob("*") if path.suffix.lower() in io.READABLE]
+    files = [p for p in folder.rglob("*") if io.suffix(p) in io.READABLE and p.is_file()]
     if not files:
         raise ValueError(f"no cloud in {folder}: expected files {', '.join(io.READABLE)}.")
     return sorted(files, key=lambda path: _natural(path.relative_to(folder)))
@@ -70,7 +70,7 @@ def _files(folder: Path) -> list[Path]:
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     words = re.split(r"(\d+)", str(path).lower())
-    return [(int(word), "") if word.isdigit() else (0, word) for word in words]
+    return [(int(word), "") if word.isdecimal() else (0, word) for word in words]
 
 
 def _drawn(path: Path, points: int, seed: tuple[int, int]) -> np.ndarray:

@@ -5,12 +5,15 @@ them make the same batch and run the same program. A part is kept as soon as it 
 all of them there has the whole.
 """
 
+import hashlib
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxreg.io.arrays import read_arrays
@@ -41,6 +44,9 @@ class Parts(NamedTuple):
     def opened(self, what: dict[str, Any]) -> None:
         """Make the folder, or look whether it holds parts of the same evaluation.
 
+        `what` says all that the results follow from, alike on every host: no paths, but what is in
+        the files.
+
         Raises:
           ValueError: it holds those of another; the numbers of the processes do not fit.
         """
@@ -53,11 +59,16 @@ class Parts(NamedTuple):
         place, text = self.folder / _WHAT, json.dumps(what, indent=1, default=str) + "\n"
         if not place.exists():
             self._write(place, lambda file: file.write(text.encode()))
-        elif place.read_text(encoding="utf-8") != text:
+        elif (there := place.read_text(encoding="utf-8")) != text:
             raise ValueError(
-                f"{self.folder} holds parts of another evaluation ({place} says which): give another "
-                "folder, or delete it."
+                f"{self.folder} holds parts of another evaluation ({_difference(there, text)}; {place} "
+                "says which): give another folder, or delete it."
             )
+
+    def keeps(self, path: Path) -> bool:
+        """Whether a file is one of those that this folder is for."""
+        known = path.name == _WHAT or re.fullmatch(r"batch_\d{6,}\.npz", path.name)
+        return bool(known) and path.resolve().parent == self.folder.resolve()
 
     def own(self, batches: int) -> list[int]:
         """The numbers of this process' batches that are not there yet, of so many."""
@@ -90,3 +101,23 @@ class Parts(NamedTuple):
         with temporary.open("wb") as file:
             save(file)
         os.replace(temporary, place)
+
+
+def digest(tree: Any) -> str:
+    """32 hexadecimal digits that stand for the arrays of a tree: their names, kinds and numbers."""
+    found = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{jax.tree_util.keystr(path)} {array.dtype.str} {array.shape}\n".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()[:32]
+
+
+def _difference(there: str, here: str) -> str:
+    """Which entries of two records differ, in words."""
+    try:
+        old, new = dict(json.loads(there)), json.loads(here)
+    except (ValueError, TypeError):
+        return "its record is damaged"
+    names = [name for name in new if name not in old or old[name] != new[name]]
+    return f"with another {' and another '.join(names)}" if names else "made in another way"

@@ -12,15 +12,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxreg import __version__
 from jaxreg.config import PEERS, Config, check_options, option_name
 from jaxreg.data import dataset_label, icl_nuim, load_shapes, pair_sizes
 from jaxreg.data.batches import given_pair_batches, key_of_tests, pair_batches, true_transforms
 from jaxreg.data.pairs import shape_points
 from jaxreg.evaluation import methods, metrics
-from jaxreg.evaluation.parts import Parts
+from jaxreg.evaluation.parts import Parts, digest
 from jaxreg.evaluation.run import evaluate_method, registered_batches, together
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.io.arrays import read_arrays
+from jaxreg.io.places import whole
 from jaxreg.progress import counting_progress
 from jaxreg.refine.config import RefineConfig
 from jaxreg.types import Pair, RigidTransform
@@ -46,11 +48,13 @@ class Stream(NamedTuple):
     """The test pairs of a configuration: how many, in batches of how many, and the batches.
 
     `batches(only=None)` takes the numbers of those to make, and yields what `pair_batches` does.
+    `read` are the arrays that came from files; procedural shapes follow from the configuration.
     """
 
     count: int
     batch: int
     batches: Callable[..., Iterator[tuple[Pair, int]]]
+    read: tuple[np.ndarray, ...]
 
 
 def pair_stream(
@@ -72,6 +76,7 @@ def pair_stream(
             lambda only=None: given_pair_batches(
                 (source, target), transforms, key, config=config.test_pairs, batch=batch, only=only
             ),
+            (source, target, transforms),
         )
     points = shape_points(config.test_pairs)
     shapes, _ = load_shapes(config.data, "test", root=root, points=points)
@@ -84,6 +89,7 @@ def pair_stream(
         lambda only=None: pair_batches(
             shapes, key, config=config.test_pairs, batch=batch, only=only
         ),
+        () if config.data.name == "shapes" else (shapes,),
     )
 
 
@@ -138,13 +144,41 @@ def evaluate(
         with counting_progress(stream.count, label) as progress:
             found = evaluate_method(function, stream.batches(), progress, initial=given)
     else:
-        parts.opened({"method": label, "pairs": stream.count, "batch": stream.batch,
-                      "config": dataclasses.asdict(config)})  # fmt: skip
+        parts.opened(_identity(config, name, refine, given, stream))
         found = _in_parts(function, stream, parts, label, given)
     if found is None:
         return None
     first = jax.tree.map(lambda x: np.asarray(x)[0], next(stream.batches([0]))[0])
     return Scored(label, dataset_label(config.data, root), found[0], found[1], first, found[2])
+
+
+def _identity(
+    config: Config, name: str, refine: str, given: RigidTransform | None, stream: Stream
+) -> dict[str, Any]:
+    """All that the results follow from: what is in the files, wherever they lie on a host."""
+    kind, settings, weights = name or "transforms", None, None
+    if methods.trained_config(name):
+        variables, trained = methods.load_network_of(name)
+        section = "model" if trained.network == "paper" else trained.network
+        kind = name.partition(":")[0]
+        settings = {trained.network: dataclasses.asdict(getattr(trained, section))}
+        weights = digest(variables)
+    asked = {
+        "model": dataclasses.asdict(config.model),
+        "test_pairs": dataclasses.asdict(config.test_pairs),
+        "data": dataclasses.asdict(config.data) | {"folder": ""},
+    }
+    return {
+        "version": __version__,
+        "method": kind + (f" + {refine}" if refine else ""),
+        "network": settings,
+        "weights": weights,
+        "transforms": None if given is None else digest(given),
+        "data": digest(stream.read) if stream.read else None,
+        "pairs": stream.count,
+        "batch": stream.batch,
+        "config": asked,
+    }
 
 
 def _in_parts(
@@ -158,7 +192,9 @@ def _in_parts(
     batches = -(-stream.count // stream.batch)
     own = parts.own(batches)
     numbered = ((k, *batch) for k, batch in zip(own, stream.batches(own), strict=True))
-    with counting_progress(len(own) * stream.batch, label) as progress:
+    # The last batch is filled up with pairs that are not counted.
+    total = sum(min(stream.batch, stream.count - number * stream.batch) for number in own)
+    with counting_progress(total, label) as progress:
         for number, found in registered_batches(function, numbered, initial=initial):
             parts.keep(number, found)
             progress(len(found.truth.rotation))
@@ -321,7 +357,7 @@ def save_transforms(path: str | Path, transforms: RigidTransform) -> None:
 
 def _save(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
     # Opened here: numpy would add .npz to a name without it.
-    with Path(path).open("wb") as file:
+    with whole(Path(path)) as part, part.open("wb") as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
@@ -334,4 +370,5 @@ def draw_first_pair(path: str | Path, scored: Scored) -> None:
     moving, fixed = (
         np.asarray(cloud.points)[np.asarray(cloud.mask)] for cloud in (source, reference)
     )
-    plot_pair(moving, fixed, transform, path, truth=truth)
+    with whole(Path(path)) as part:
+        plot_pair(moving, fixed, transform, part, truth=truth)

@@ -146,15 +146,12 @@ def check_normals(
 
 
 def check_pose(pose: object, name: str) -> RigidTransform:
-    """A 4x4 matrix or a `RigidTransform` as a float64 transform with an orthogonal rotation.
+    """A pose of `pose_parts` as a float64 transform with an orthogonal rotation.
 
     Raises:
-      ValueError: it is neither, or not finite, or not rigid.
+      ValueError: it is none, or not finite, or not rigid.
     """
-    if isinstance(pose, RigidTransform):
-        rotation, translation = (np.asarray(part, np.float64) for part in pose)
-    else:
-        rotation, translation = _parts_of_matrix(pose, name)
+    rotation, translation = pose_parts(pose, name)
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise ValueError(f"{name} contains NaN or infinity: give a finite transform.")
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
@@ -163,6 +160,23 @@ def check_pose(pose: object, name: str) -> RigidTransform:
             "determinant +1): remove scale, shear and mirroring."
         )
     return RigidTransform(nearest_rotation(rotation), translation)
+
+
+def pose_parts(pose: object, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) of a 4x4 matrix, a `RigidTransform` or a result, unchecked.
+
+    Raises:
+      ValueError: it is none of these, or of many poses.
+    """
+    if not (hasattr(pose, "rotation") and hasattr(pose, "translation")):
+        return _parts_of_matrix(pose, name)
+    rotation, translation = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation))  # pyright: ignore[reportAttributeAccessIssue]
+    if rotation.shape != (3, 3) or translation.shape != (3,):
+        raise ValueError(
+            f"{name} has a rotation of shape {rotation.shape} and a translation of shape "
+            f"{translation.shape}: give one pose, (3, 3) and (3,)."
+        )
+    return rotation, translation
 
 
 def _parts_of_matrix(pose: object, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -20,14 +20,15 @@ def points_of(cloud: object, name: str) -> object:
         names = cloud.dtype.names or ()
         if not set("xyz") <= set(names):
             return cloud
-        return np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1)
+        stack = np.ma.stack if isinstance(cloud, np.ma.MaskedArray) else np.stack
+        return stack([cloud[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     if hasattr(cloud, "columns") and hasattr(cloud, "to_numpy"):
         return _of_table(cloud)
     for attribute in ("points", "vertices"):
         found = getattr(cloud, attribute, None)
         if found is not None and not callable(found):
             _check_mesh(cloud, len(found), name)
-            return np.asarray(found)
+            return found if isinstance(found, np.ma.MaskedArray) else np.asarray(found)
     positions = getattr(getattr(cloud, "point", None), "positions", None)
     return cloud if positions is None else positions.cpu().numpy()
 

@@ -4,17 +4,19 @@ Levenberg-Marquardt with conjugate gradients: memory grows with the edges, nothi
 the host `sparse` solves the same problem by a sparse factorisation, which long chains need.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import se3
+from jaxreg.geometry import arguments, se3
 from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.graph.pose_graph import (
     CHI_SQUARED,
     PoseGraph,
+    check_indices,
     edge_equations,
     retract,
     squared_errors,
@@ -33,7 +35,8 @@ _LAST_CONTROL = 1e4
 class OptimizedPoses(NamedTuple):
     """Poses that minimise the cost of a graph.
 
-    `weights` are those of the edges (1 without `robust`), `squared_errors` their ``e^T Omega e``.
+    `weights` are those of the edges (1 without `robust`, 0 where an edge is masked), `squared_errors`
+    their ``e^T Omega e``.
     `decrement` is how much another Gauss-Newton step would lower the cost, relative to it: small if
     the iterations converged.
     """
@@ -80,7 +83,12 @@ def optimize_poses(
     Derivatives by `graph.transform` and `graph.information` are those of the minimum, by the implicit
     function theorem with the weights held; they need a converged result, so float64. There is none by
     `initial`.
+
+    Raises:
+      ValueError: an array has another shape than `PoseGraph` says, or an index, where it is not traced,
+        is out of range.
     """
+    _check(graph, initial, fixed)
     # Where some are numpy's, others must not be traced by numpy.
     graph, initial = jax.tree.map(jnp.asarray, (graph, initial))
     count = initial.translation.shape[0]
@@ -90,20 +98,52 @@ def optimize_poses(
     squared = squared_errors(still, start)
     first = threshold / jnp.maximum(2 * jnp.max(squared) - threshold, 1e-3 * threshold)
     rounds = _ROUNDS if robust else 0
+    counted = still.mask.astype(squared.dtype)
 
     def iterate(k, state: _State) -> _State:
         control = first * (_LAST_CONTROL / first) ** (jnp.minimum(k, rounds) / max(rounds, 1))
         weights = state.weights
         if robust:
             graduated = truncated_weights(state.squared, threshold, control)
-            weights = jnp.where(k <= rounds, graduated, state.weights)
+            weights = jnp.where(k <= rounds, counted * graduated, state.weights)
         return _step(still, held, state._replace(weights=weights.astype(squared.dtype)), most)
 
-    state = _State(start, squared, jnp.ones_like(squared), jnp.asarray(_DAMPING, squared.dtype))
+    state = _State(start, squared, counted, jnp.asarray(_DAMPING, squared.dtype))
     state = jax.lax.fori_loop(0, rounds + iterations, iterate, state)
     step, decrement = _implicit_step(graph, state.poses, held, state.weights, most)
     poses = retract(state.poses, step)
     return OptimizedPoses(poses, state.weights, squared_errors(graph, poses), decrement)
+
+
+def _check(graph: PoseGraph, initial: RigidTransform, fixed: Any) -> None:
+    """At trace time: a row that does not exist would be clamped, and another pose moved."""
+    poses = arguments.leading_axes("initial", initial)
+    if len(poses) != 1:
+        raise ValueError(
+            f"initial must be poses with one leading axis, got {poses}: give one pose for every scan, "
+            "and use jax.vmap for a batch."
+        )
+    shapes = [
+        ("source", np.shape(graph.source), ()),
+        ("reference", np.shape(graph.reference), ()),
+        ("transform", arguments.leading_axes("graph.transform", graph.transform), ()),
+        ("information", np.shape(graph.information), (6, 6)),
+        ("mask", np.shape(graph.mask), ()),
+    ]
+    edges = np.shape(graph.source)[:1]
+    for name, shape, rest in shapes:
+        if len(edges) != 1 or shape != (*edges, *rest):
+            raise ValueError(
+                f"graph.{name} has the axes {shape}, but graph.source {np.shape(graph.source)}: give "
+                "one row for every edge."
+            )
+    for name, flags, count in (("graph.mask", graph.mask, edges), ("fixed", fixed, poses)):
+        if flags is not None and (np.shape(flags) != count or jnp.result_type(flags).kind != "b"):
+            raise ValueError(
+                f"{name} must be bool of shape {count}, got {jnp.result_type(flags)} of "
+                f"{np.shape(flags)}."
+            )
+    check_indices(graph, *poses)
 
 
 def _step(graph: PoseGraph, held, state: _State, most: int) -> _State:

@@ -8,6 +8,8 @@ its reference, so that without errors ``Z = X_r^-1 X_s``. Its residual is
 
 from typing import Any, NamedTuple
 
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from jaxreg.geometry import se3
@@ -29,6 +31,24 @@ class PoseGraph(NamedTuple):
     transform: RigidTransform
     information: Float[Any, "e 6 6"]
     mask: Bool[Any, "e"]
+
+
+def check_indices(graph: PoseGraph, count: int) -> None:
+    """Raise ValueError unless edges join poses that are there, as far as it is known (not traced)."""
+    for name, index in (("source", graph.source), ("reference", graph.reference)):
+        index = index if isinstance(index, Tracer) else np.asarray(index)
+        if index.dtype.kind not in "iu":
+            raise ValueError(
+                f"graph.{name} has dtype {index.dtype}: give integers, the numbers of poses from 0."
+            )
+        if isinstance(index, Tracer):
+            continue
+        wrong = index[(index < 0) | (index >= count)]
+        if len(wrong):
+            raise ValueError(
+                f"graph.{name} has the index {wrong[0]}, but there are {count} poses: number them "
+                "from 0."
+            )
 
 
 class EdgeEquations(NamedTuple):

@@ -15,6 +15,7 @@ from jaxreg.graph.pose_graph import (
     CHI_SQUARED,
     EdgeEquations,
     PoseGraph,
+    check_indices,
     edge_equations,
     retract,
     squared_errors,
@@ -101,13 +102,8 @@ class _Problem(NamedTuple):
 
 
 def _check(graph: PoseGraph, initial: RigidTransform) -> None:
-    nodes, kept = len(initial.translation), np.asarray(graph.mask, bool)
-    for name, index in (("source", graph.source), ("reference", graph.reference)):
-        if len(index) and not (index.min() >= 0 and index.max() < nodes):
-            raise ValueError(
-                f"graph.{name} has the index {index.max() if index.min() >= 0 else index.min()}, but "
-                f"there are {nodes} poses: number them from 0."
-            )
+    check_indices(graph, len(initial.translation))
+    kept = np.asarray(graph.mask, bool)
     if not all(np.isfinite(part).all() for part in initial):
         raise ValueError("an initial pose is not finite: give one for every scan.")
     for name, part in (("transform", graph.transform), ("information", (graph.information,))):

@@ -11,7 +11,7 @@ from jaxreg.io.arrays import read_numbers
 from jaxreg.io.contents import Scan
 from jaxreg.io.matrix import read_matrix
 from jaxreg.io.merged import read_colors, write_merged
-from jaxreg.io.places import check_folder, check_place, whole
+from jaxreg.io.places import check_folder, check_place, reading, whole
 from jaxreg.io.poses import check_poses_output, read_pairs_log, read_poses, write_poses
 from jaxreg.io.writing import WRITERS, check_output, check_writable, write_cloud, write_moved
 
@@ -66,9 +66,9 @@ def read_cloud(path: str | Path) -> Float[np.ndarray, "n 3"]:
     the caller to refuse or to drop. Nothing is ever unpickled.
 
     Raises:
-      ValueError: there is no such file, it is a directory, its suffix is unknown, it is malformed or
-        truncated, its header names columns without x, y, z, or it contains no points; the message
-        names the file, the row where there is one, and the remedy.
+      ValueError: there is no such file, it is a directory, it may not be read, its suffix is unknown,
+        it is malformed or truncated, its header names columns without x, y, z, or it contains no
+        points; the message names the file, the row where there is one, and the remedy.
       ImportError: a LAS, LAZ or E57 file, and what reads it is not installed.
     """
     return read_scan(path).points
@@ -81,14 +81,16 @@ def read_scan(path: str | Path) -> Scan:
       ValueError, ImportError: as `read_cloud`.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory, not a file: name a file in it.")
-    if suffix(path) not in _READERS:
-        raise ValueError(unread.advice(path, READABLE))
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; check the path.")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path} is empty (0 bytes): export it again.")
+    with reading(path):
+        if path.is_dir():
+            raise IsADirectoryError
+        if suffix(path) not in _READERS:
+            raise ValueError(unread.advice(path, READABLE))
+        if not path.is_file():
+            raise FileNotFoundError
+        path.open("rb").close()  # Readers would take a lack of permission for damage.
+        if path.stat().st_size == 0:
+            raise ValueError(f"{path} is empty (0 bytes): export it again.")
     # A damaged file holds numbers that overflow, and NaN that signal.
     with packed.unpacked(path) as file, np.errstate(all="ignore"):
         scan = _READERS[suffix(path)](file)

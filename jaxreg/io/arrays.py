@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.contents import TWO_COLUMNS, Scan
+from jaxreg.io.places import reading
 
 
 def read(path: Path) -> Scan:
@@ -55,15 +56,19 @@ def read_numbers(path: Path, count: int, *, what: str = "point") -> np.ndarray:
     """One number a point, or whatever `what` says: text with one a line, or NPY.
 
     Raises:
-      ValueError: there is no such file, it holds no numbers, or not `count` of them.
+      ValueError: there is no such file, it is a directory, it may not be read, it holds no numbers,
+        or not `count` of them.
     """
-    try:
-        loaded = _loaded(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, ndmin=1)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path.") from None
-    except Exception as error:  # noqa: BLE001 - numpy raises types of its own
-        told = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} holds no numbers ({told}): write one for each {what}.") from None
+    with reading(path):
+        try:
+            loaded = _loaded(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, ndmin=1)
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001 - numpy raises types of its own
+            told = " ".join(str(error).split())[:200]
+            raise ValueError(
+                f"{path} holds no numbers ({told}): write one for each {what}."
+            ) from None
     numbers = np.asarray(loaded)
     if numbers.shape != (count,) or numbers.dtype.kind not in "bfiu":
         raise ValueError(
@@ -93,7 +98,7 @@ def _chosen(named: dict[str, np.ndarray], path: Path) -> Scan:
 
 
 def _scan(array: np.ndarray, where: str) -> Scan:
-    planar = array.ndim == 2 and array.shape[1] == 2
+    planar = array.dtype.names is None and array.ndim == 2 and array.shape[1] == 2
     return Scan(_points(array, where), (TWO_COLUMNS,) if planar else ())
 
 

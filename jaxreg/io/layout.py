@@ -20,18 +20,20 @@ _UNIT = re.compile(r"\s+(?=[\[(][^\W\d]+[\])])")
 _COMMA = re.compile(r"(?<![\d.,])[+-]?\d*,\d+([eE][+-]?\d+)?(?![\d.,])")
 _POINT = re.compile(r"\d\.\d")
 _WHOLE = re.compile(r"[+-]?\d+")
+_COUNT = re.compile(r"\d{1,18}")
+"""A number that `int` reads: it takes no "²", and no more than some thousands of digits."""
 
 
 class Layout(NamedTuple):
-    """`columns` are those of x, y, z, `normals` those of a normal; `first` is the line of a point.
+    """`columns` are those of x, y, z (or x, y alone), `normals` those of a normal.
 
-    `comma`: the decimal mark is a comma. `separator` None is any run of blanks and tabs. `count` is
-    the number of points that a line of its own announces.
+    `first` is the line of a point. `comma`: the decimal mark is a comma. `separator` None is any run
+    of blanks and tabs. `count` is the number of points that a line of its own announces.
     """
 
     separator: str | None
     comma: bool
-    columns: tuple[int, int, int]
+    columns: tuple[int, ...]
     normals: tuple[int, int, int] | None
     first: int
     count: int | None
@@ -59,6 +61,11 @@ def split(line: str, separator: str | None) -> list[str]:
     """The fields of a line, without blanks and quotes around them."""
     line = line.strip(" \n" if separator else None)
     return [field.strip().strip('"') for field in line.split(separator)]
+
+
+def is_count(field: str) -> bool:
+    """Whether a field is a whole number without a sign."""
+    return _COUNT.fullmatch(field) is not None
 
 
 def uncommented(line: str) -> str:
@@ -153,7 +160,7 @@ def _run(rows: list[list[str]], comma: bool) -> list[int]:
 
 
 def _announces(row: list[str]) -> bool:
-    return len(row) == 1 and row[0].isdigit()
+    return len(row) == 1 and is_count(row[0])
 
 
 def _without_points(path: Path, data: list, rows: list[list[str]]) -> None:
@@ -247,7 +254,7 @@ def _unnamed(
         label = [row[run[0]] for row in rows]
         others = [[row[c] for row in rows] for c in run[1:4]]
         parts = [sum("." in f or "," in f for f in column) > len(rows) / 2 for column in others]
-        if sum(parts) >= 2 and all(map(str.isdigit, label)) and _rises(label):
+        if sum(parts) >= 2 and all(map(is_count, label)) and _rises(label):
             raise ValueError(
                 f"{path}, line {first}: column {run[0] + 1} seems to number the points ({label[0]}, "
                 f"{label[1]}, {label[2]} ...), and no header says so: put a line above the points "

@@ -5,18 +5,23 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxreg.io.places import reading
+
 
 def read_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """The columns of a `metrics.jsonl`; NaN if a line has no such entry.
 
     Raises:
-      ValueError: there is no such file, it is empty, or a line is not a JSON object.
+      ValueError: there is no such file, it may not be read, it is empty, or a line is not a JSON
+        object.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"no metrics at {path}: give the metrics.jsonl of a training run.")
+    with reading(path):
+        if not path.is_file():
+            raise ValueError(f"no metrics at {path}: give the metrics.jsonl of a training run.")
+        lines = path.read_text(encoding="utf-8").splitlines()
     entries = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         try:
             entries.append(dict(json.loads(line)))
         except (ValueError, TypeError):

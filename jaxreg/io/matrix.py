@@ -7,20 +7,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.io.places import reading
+
 
 def read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
     """A 4x4 matrix from text, NPY, or the JSON that `jaxreg register` writes.
 
     Raises:
-      ValueError: there is no such file, or it does not contain a 4x4 matrix.
+      ValueError: there is no such file, it is a directory, it may not be read, or it does not
+        contain a 4x4 matrix.
     """
     remedy = "write four lines of four numbers"
-    try:
-        matrix = np.asarray(_content(path), float)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path.") from None
-    except (ValueError, KeyError, TypeError, EOFError) as error:
-        raise ValueError(f"{path} does not contain a 4x4 matrix ({error}): {remedy}.") from None
+    with reading(path):
+        try:
+            matrix = np.asarray(_content(path), float)
+        except (ValueError, KeyError, TypeError, EOFError) as error:
+            raise ValueError(f"{path} does not contain a 4x4 matrix ({error}): {remedy}.") from None
     if matrix.shape != (4, 4):
         raise ValueError(f"{path} contains an array {matrix.shape}, not a 4x4 matrix: {remedy}.")
     return matrix
@@ -32,9 +34,12 @@ def _content(path: Path) -> object:
         return content["transformation"] if isinstance(content, dict) else content
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
-    # Brackets and commas too: what Python prints can be pasted.
-    numbers = re.sub(r"#.*|[\[\],;]", " ", path.read_text("utf-8")).split()
-    return np.array(numbers, float).reshape(4, 4)
+    return np.array(words(path.read_text("utf-8")), float).reshape(4, 4)
+
+
+def words(text: str) -> list[str]:
+    """The numbers in a text; comments, brackets and commas may be there, as Python prints them."""
+    return re.sub(r"#.*|[\[\],;]", " ", text).split()
 
 
 def turn_of(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

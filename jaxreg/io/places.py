@@ -1,4 +1,4 @@
-"""Where files are written: checked before the work; a file is written whole or left as it was."""
+"""Where files are read and written: a file is written whole or left as it was."""
 
 import contextlib
 import os
@@ -19,6 +19,25 @@ def check_folder(path: Path) -> None:
     """Raise ValueError unless there is a folder for the file."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist: make it first.")
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """What is done inside reads the file `path`.
+
+    Raises:
+      ValueError: there is no such file, it is a directory, or it may not be read.
+    """
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"{path}: no such file; check the path.") from None
+    except OSError as error:
+        if os.path.isdir(path):  # Windows calls this, too, a lack of permission.
+            raise ValueError(f"{path} is a directory, not a file: name a file in it.") from None
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}): check who may read it, or copy it."
+        ) from None
 
 
 @contextlib.contextmanager

@@ -179,7 +179,7 @@ def _lists(path: Path, header: bytes, size: int, *, text: bool) -> dict[str, dic
     element, rows, announced = "", 0, 0
     for line in header.decode("latin-1").splitlines():
         words = line.split()
-        if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+        if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             element, rows = words[1], int(words[2])
             announced += rows
         elif words[:1] == ["property"]:

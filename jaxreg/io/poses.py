@@ -1,17 +1,22 @@
 """Poses of many scans as a file: JSON, 4x4 text, TUM, KITTI and g2o; and 3DMatch's logs."""
 
 import json
-import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxreg.io.matrix import words
+from jaxreg.io.places import reading
+
 FORMATS = (".json", ".txt", ".tum", ".kitti", ".g2o")
 _SWAP = [3, 4, 5, 0, 1, 2]
 _REMEDY = "export the poses again"
+_Poses = Mapping[Any, np.ndarray | None]
+"""By names, or by numbers (int) in a file without names; None is a scan without a pose."""
 
 
 class Edges(NamedTuple):
@@ -67,44 +72,42 @@ def write_poses(
 def read_poses(path: str | Path, names: Sequence[str] = ()) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Poses by name: of JSON and 4x4 text the names there, of other files the numbers of the scans.
 
-    With `names` (of the scans, in their order) the result has an entry for every scan that has a pose:
-    it is found by its name, its file name, its stem, or its number, from 0.
+    With `names` (of the scans, in their order) the result has an entry for every scan that has a pose.
+    In files with names it is found by its path, or by as much of its end as tells it from all others:
+    the file name or the stem, and the folders before it. In files without names, or with none of
+    these but numbers, it is found by its number, from 0.
 
     Raises:
-      ValueError: there is no such file, it is malformed, or none of the names has a pose in it.
+      ValueError: there is no such file, it is a directory, it may not be read, it is malformed, none of
+        the scans has a pose in it, or a scan could have several.
     """
     path = Path(path)
-    try:
-        found = _read(path)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path.") from None
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"{path} does not contain poses ({error}): {_REMEDY}.") from None
-    return _named(path, found, names) if names else found
+    found = _read(path)
+    if names:
+        return _of_scans(path, found, names)
+    return {str(key): pose for key, pose in found.items() if pose is not None}
 
 
 def read_g2o(path: str | Path) -> tuple[dict[int, Float[np.ndarray, "4 4"]], Edges]:
     """The vertices (by number) and edges of a g2o file of 3-D poses (``SE3:QUAT``).
 
     Raises:
-      ValueError: there is no such file, or a line is malformed.
+      ValueError: there is no such file, it is a directory, it may not be read, or a line is malformed.
     """
     path = Path(path)
     vertices: dict[int, np.ndarray] = {}
     ends, transforms, information = [], [], []
-    try:
+    with reading(path):
         lines = path.read_text("utf-8").splitlines()
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path.") from None
     for number, line in enumerate(lines, start=1):
-        words = line.split()
+        row = line.split()
         try:
-            if words[:1] in (["VERTEX_SE3:QUAT"],):
-                vertices[int(words[1])] = _from_quaternion(_floats(words[2:9], 7))
-            elif words[:1] == ["EDGE_SE3:QUAT"]:
-                ends.append((int(words[1]), int(words[2])))
-                transforms.append(_from_quaternion(_floats(words[3:10], 7)))
-                information.append(_rotation_first(_symmetric(_floats(words[10:31], 21))))
+            if row[:1] == ["VERTEX_SE3:QUAT"]:
+                vertices[int(row[1])] = _from_quaternion(_floats(row[2:9], 7))
+            elif row[:1] == ["EDGE_SE3:QUAT"]:
+                ends.append((int(row[1]), int(row[2])))
+                transforms.append(_from_quaternion(_floats(row[3:10], 7)))
+                information.append(_rotation_first(_symmetric(_floats(row[10:31], 21))))
         except (ValueError, IndexError) as error:
             raise ValueError(f"{path}, line {number} is malformed ({error}): {_REMEDY}.") from None
     both = np.array(ends, np.int64).reshape(-1, 2)
@@ -121,84 +124,159 @@ def read_pairs_log(
     """(i, j) and T of a log of 3DMatch: T maps fragment j to the frame of fragment i.
 
     Raises:
-      ValueError: there is no such file, or it is not made of blocks of five lines.
+      ValueError: there is no such file, it is a directory, it may not be read, or it is not made of
+        blocks of five lines.
     """
     path = Path(path)
+    with reading(path):
+        text = path.read_text("utf-8")
     try:
-        rows = [line.split() for line in path.read_text("utf-8").splitlines() if line.strip()]
+        rows = [line.split() for line in text.splitlines() if line.strip()]
         if len(rows) % 5:
             raise ValueError(f"{len(rows)} lines, no multiple of 5")
         ends = np.array([[int(word) for word in row[:2]] for row in rows[::5]], np.int64)
         values = [[float(word) for word in row] for k, row in enumerate(rows) if k % 5]
         return ends.reshape(-1, 2), np.array(values, np.float64).reshape(-1, 4, 4)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path.") from None
     except ValueError as error:
         raise ValueError(f"{path} is no log of pairs ({error}): download it again.") from None
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    kind = path.suffix.lower()
-    if kind == ".json":
-        content = json.loads(path.read_text("utf-8"))
-        poses = content.get("poses", content) if isinstance(content, dict) else content
-        items = poses.items() if isinstance(poses, dict) else enumerate(poses)
-        return {str(name): _checked(pose) for name, pose in items if pose is not None}
-    if kind == ".g2o":
-        return {str(number): pose for number, pose in read_g2o(path)[0].items()}
-    lines = path.read_text("utf-8").splitlines()
-    rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    numbers = [_floats(re.split(r"[\s,]+", row.strip())) for row in rows]
-    widths = {len(row) for row in numbers}
+def _read(path: Path) -> _Poses:
+    """All that a file has: a scan without a pose counts, since its name is that of no other scan."""
+    if path.suffix.lower() == ".g2o":
+        return read_g2o(path)[0]
+    with reading(path):
+        try:
+            text = path.read_text("utf-8")
+            return _from_json(text) if path.suffix.lower() == ".json" else _from_text(text)
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise ValueError(f"{path} does not contain poses ({error}): {_REMEDY}.") from None
+
+
+def _from_json(text: str) -> _Poses:
+    content = json.loads(text)
+    poses = content.get("poses", content) if isinstance(content, dict) else content
+    items = poses.items() if isinstance(poses, dict) else enumerate(poses)
+    return {key: None if pose is None else _checked(pose) for key, pose in items}
+
+
+def _from_text(text: str) -> _Poses:
+    lines = text.splitlines()
+    rows = [_floats(row) for row in map(words, lines) if row]
+    widths = {len(row) for row in rows}
     if widths == {12}:
         last = [0.0, 0.0, 0.0, 1.0]
-        poses = {str(k): _checked([*row, *last]) for k, row in enumerate(numbers) if _finite(row)}
-    elif widths == {8}:
-        # The time of a row counts the scans, whatever its unit: rows are in their order.
-        whole = all(row[0] == int(row[0]) and row[0] < 1e6 for row in numbers)
-        poses = {
-            str(int(row[0]) if whole else k): _from_quaternion(row[1:])
-            for k, row in enumerate(numbers)
+        return {k: _checked([*row, *last]) if _finite(row) else None for k, row in enumerate(rows)}
+    if widths == {8}:
+        times = [row[0] for row in rows]
+        # Numbers of scans as `write_poses` has them, or times: these count the rows in their order.
+        numbers = all(0 <= t < 1e6 and t == int(t) for t in times) and len(set(times)) == len(rows)
+        return {
+            int(row[0]) if numbers else k: _from_quaternion(row[1:]) if _finite(row[1:]) else None
+            for k, row in enumerate(rows)
         }
-    else:
-        poses = _from_matrix_text(lines)
-    return poses
+    return _from_matrix_text(lines)
 
 
-def _from_matrix_text(lines: list[str]) -> dict[str, np.ndarray]:
+def _from_matrix_text(lines: list[str]) -> _Poses:
     """Blocks of four lines of four numbers, each below a comment with its name, or numbered."""
-    poses, name, rows = {}, None, []
+    names: list[str | None] = []
+    poses: list[np.ndarray | None] = []
+    name, rows = None, []
     for line in lines:
         if line.lstrip().startswith("#"):
             name = line.lstrip("# \t").strip() or None
-        elif line.strip():
-            rows.append(_floats(re.split(r"[\s,]+", line.strip("[] \t;")), 4))
+        elif row := words(line):
+            rows.append(_floats(row, 4))
         if len(rows) == 4:
-            matrix = np.array(rows)
-            if np.isfinite(matrix).all():
-                poses[name or str(len(poses))] = _checked(matrix)
+            names.append(name)
+            poses.append(_checked(rows) if np.isfinite(rows).all() else None)
             name, rows = None, []
     if rows or not poses:
         raise ValueError("it is not made of blocks of four lines of four numbers")
-    return poses
+    if not any(names[1:]) and (len(names) > 1 or names[0] is None):
+        return dict(enumerate(poses))  # A comment above the first of many is a title.
+    known = [name for name in names if name is not None]
+    if len(known) < len(names):
+        raise ValueError(f"block {names.index(None) + 1} has no name above it, and others have one")
+    if len(set(known)) < len(known):
+        twice = next(name for k, name in enumerate(known) if name in known[:k])
+        raise ValueError(f"two blocks have the name {twice}")
+    return dict(zip(known, poses, strict=True))
 
 
-def _named(path: Path, found: Mapping[str, np.ndarray], names: Sequence[str]) -> dict:
-    by_stem = {Path(name).name: pose for name, pose in found.items()}
-    by_stem |= {Path(name).stem: pose for name, pose in found.items()}
-    chosen = {}
-    for k, name in enumerate(names):
-        for key in (name, Path(name).name, Path(name).stem, str(k)):
-            pose = found.get(key, by_stem.get(key))
-            if pose is not None:
-                chosen[name] = pose
-                break
+def _of_scans(path: Path, found: _Poses, names: Sequence[str]) -> dict[str, np.ndarray]:
+    keys = [key for key in found if isinstance(key, str)]
+    by_name = _by_path(path, keys, list(dict.fromkeys(names)))
+    _check_numbers(path, keys, by_name, names)
+    by_number = {name: found.get(k, found.get(str(k))) for k, name in enumerate(names)}
+    given = {name: found[key] for name, key in by_name.items()} if by_name else by_number
+    chosen = {name: pose for name in names if (pose := given.get(name)) is not None}
     if not chosen:
+        known = [str(key) for key, pose in found.items() if pose is not None]
         raise ValueError(
-            f"{path} has poses of {', '.join(list(found)[:4])}, and none of these scans: name them as "
-            "the files, or number them from 0."
+            f"{path} has poses of {', '.join(known[:4]) or 'nothing'}, and none of these scans: name "
+            "them as the files, or number them from 0."
         )
     return chosen
+
+
+def _by_path(path: Path, keys: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Which key each scan has: the one with the longest end in common, if no other has it, too.
+
+    Raises:
+      ValueError: there are several.
+    """
+    scans, poses = _by_end(names), _by_end(keys)
+    chosen: dict[str, str] = {}
+    taken: set[str] = set()
+    # Longest ends first, and of a file its whole name before its stem.
+    for end in sorted(scans.keys() & poses.keys(), key=lambda e: (-len(e), -len(e[-1]))):
+        if len(scans[end]) == len(poses[end]) == 1:
+            (name,), (key,) = scans[end], poses[end]
+            if name not in chosen and key not in taken:
+                chosen[name] = key
+                taken.add(key)
+    for name in (name for name in names if name not in chosen):
+        alike = [key for form in _forms(name) for key in poses.get((form,), ()) if key not in taken]
+        if alike:
+            raise ValueError(
+                f"{path}: whether {name} has the pose of {' or '.join(dict.fromkeys(alike[:9]))} is "
+                "open, since several files have this name: name the poses by paths that differ."
+            )
+    return chosen
+
+
+def _by_end(names: Sequence[str]) -> dict[tuple[str, ...], list[str]]:
+    """The names by the ends of their paths, of any number of folders; a whole path begins with ""."""
+    ends = defaultdict(list)
+    for name in names:
+        folders = ("", *Path(name).parts[:-1])
+        for form in _forms(name):
+            ends[(form,)].append(name)
+            for k in range(1, len(folders) + 1):
+                ends[(*folders[-k:], form)].append(name)
+    return ends
+
+
+def _forms(name: str) -> list[str]:
+    """The file name, without ``.gz``, and without the suffix; the ".17" of a time is none."""
+    whole = Path(name).name
+    plain = whole.removesuffix(".gz")
+    stem = plain if plain.rpartition(".")[2].isdecimal() else Path(plain).stem
+    return list(dict.fromkeys((whole, plain, stem)))
+
+
+def _check_numbers(
+    path: Path, keys: Sequence[str], by_name: Mapping[str, str], names: Sequence[str]
+) -> None:
+    """Raises ValueError where keys that are numbers may be names as well as positions."""
+    places = {str(k) for k in range(len(names))}
+    if by_name and set(keys) <= places and len(by_name) < len(keys):
+        raise ValueError(
+            f"{path} has numbers, {', '.join(keys[:4])}, which may be names of the scans or count them "
+            "from 0: name the poses as the files."
+        )
 
 
 def _checked(pose: object) -> np.ndarray:

@@ -9,13 +9,15 @@ import numpy as np
 
 from jaxreg.io.contents import TWO_COLUMNS, Scan
 from jaxreg.io.decoding import decoded, number
-from jaxreg.io.layout import Layout, is_data, lines, recognised, split, uncommented
+from jaxreg.io.layout import Layout, is_count, is_data, lines, recognised, split, uncommented
 from jaxreg.io.matrix import turn_of
 
 SUFFIXES = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzn", ".xyzrgb", ".xyzi", ".dat")
 WRITABLE = (".xyz", ".txt", ".csv", ".asc")
 _FEWEST = 3
 """Fewer lines of two numbers may be anything."""
+_LEVEL = 1e-9
+"""Heights below this share of the extent are rounding."""
 _GRID = re.compile(r"\s*ncols\s+\d+\s+nrows\s+\d+", re.IGNORECASE)
 
 
@@ -37,31 +39,43 @@ def read(path: Path) -> Scan:
             "gdal_translate -of XYZ grid.asc points.xyz."
         )
     if (planar := _in_plane(text)) is not None:
-        return Scan(planar, (TWO_COLUMNS,))
+        return Scan(planar[0], (TWO_COLUMNS,))
     layout = recognised(path, text)
     if layout is None:
         return Scan(np.empty((0, 3)))
     return Scan(_points(path, text, layout))
 
 
-def _in_plane(text: str) -> np.ndarray | None:
-    """The points of a file of x and y alone, with z = 0; None for any other file."""
-    rows = []
-    for _, line in lines(text):
+def _in_plane(text: str) -> tuple[np.ndarray, Layout] | None:
+    """The points of a file of x and y alone, with z = 0, and its layout; None for any other file.
+
+    What parts the columns is told line by line: the separator of the layout is that of no line.
+    """
+    rows, first, comma = [], 0, False
+    for count, line in lines(text):
         if not is_data(line):
             continue
         line = uncommented(line).strip()
-        mark = next((mark for mark in ";|" if mark in line), None)
-        alone = "," in line and (len(line.split()) == 1 or ", " in line)
-        mark = mark or ("," if alone else None)
+        mark = _mark(line)
         fields = [number(field, comma=mark == ";") for field in split(line, mark)]
         if len(fields) != 2 or (None in fields and rows):
             return None
         if None not in fields:
             rows.append(fields)
+            first = first or count
+            comma = comma or (mark == ";" and "," in line)
     if len(rows) < _FEWEST:
         return None
-    return np.column_stack([np.array(rows, np.float64), np.zeros(len(rows))])
+    points = np.column_stack([np.array(rows, np.float64), np.zeros(len(rows))])
+    return points, Layout(None, comma, (0, 1), None, first, None)
+
+
+def _mark(line: str) -> str | None:
+    """What parts the two columns of a line; None: blanks and tabs."""
+    line = uncommented(line).strip()
+    mark = next((mark for mark in ";|" if mark in line), None)
+    alone = "," in line and (len(line.split()) == 1 or ", " in line)
+    return mark or ("," if alone else None)
 
 
 def write(path: Path, points: np.ndarray) -> None:
@@ -71,33 +85,60 @@ def write(path: Path, points: np.ndarray) -> None:
     np.savetxt(path, points, fmt="%.12g", delimiter=delimiter, header=header, comments="")
 
 
-def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
+def write_moved(
+    path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray
+) -> tuple[str, ...]:
     """Write a text file again with its points (and normals) moved and everything else kept.
 
     Columns stay in their order, rows without a point and comments as they are. To a ``.csv`` from
-    columns parted by blanks, commas part them. The text becomes UTF-8.
+    columns parted by blanks, commas part them. The text becomes UTF-8. Returns what it cannot hold:
+    a height beside two columns.
     """
     text = decoded(original, original.read_bytes())
-    layout = recognised(original, text)
+    planar = _in_plane(text)
+    layout = recognised(original, text) if planar is None else planar[1]
     if layout is None:
         raise ValueError(f"{original} contains no points: choose another file.")
-    moved = iter(_points(original, text, layout) @ rotation.T + translation)
-    commas = path.suffix.lower() == ".csv" and layout.separator is None and not layout.comma
+    points = _points(original, text, layout) if planar is None else planar[0]
+    moved = points @ rotation.T + translation
+    rows, csv = iter(moved), path.suffix.lower() == ".csv"
     with path.open("w", encoding="utf-8", newline="\n") as file:
         for count, line in lines(text):
+            here = layout if planar is None else _of_line(layout, line)
             new = line
             if count >= layout.first and is_data(line) and not _counts(line, layout):
-                new = _replaced(line, layout, next(moved), rotation)
+                new = _replaced(line, here, next(rows), rotation)
+            commas = csv and here.separator is None and not here.comma
             if commas and is_data(line) and not _counts(line, layout):
                 new = ",".join(new.split())
             file.write(new + "\n")
+    return () if planar is None else _without_height(moved)
+
+
+def _of_line(layout: Layout, line: str) -> Layout:
+    """The layout of one line of a file of two columns."""
+    mark = _mark(line)
+    return layout._replace(separator=mark, comma=layout.comma and mark == ";")
+
+
+def _without_height(moved: np.ndarray) -> tuple[str, ...]:
+    finite = moved[np.isfinite(moved).all(axis=1)]
+    if len(finite) == 0:
+        return ()
+    height = np.abs(finite[:, 2]).max()
+    if height <= _LEVEL * np.ptp(finite[:, :2], axis=0).max():
+        return ()
+    return (f"two columns hold x and y alone: z, up to {height:.3g}, is left out",)
 
 
 def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray) -> str:
-    parts = re.split(r"(\s+)", line) if layout.separator is None else line.split(layout.separator)
+    body = uncommented(line)
+    body = body if body == line else body.rstrip(" ")
+    parts = re.split(r"(\s+)", body) if layout.separator is None else body.split(layout.separator)
     # Between the fields of blanks stand the blanks; before the first may stand some, too.
     places = [i for i, part in enumerate(parts) if layout.separator or part.strip()]
-    new = dict(zip(layout.columns, point, strict=True)) if np.isfinite(point).all() else {}
+    whole = np.isfinite(point[list(layout.columns)]).all()
+    new = dict(zip(layout.columns, point, strict=False)) if whole else {}
     if layout.normals and new:
         fields = [parts[places[c]].strip().strip('"') for c in layout.normals]
         vector = [number(field, comma=layout.comma) for field in fields]
@@ -108,7 +149,7 @@ def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray
     for column, value in new.items():
         digits = f"{value:.12g}"
         parts[places[column]] = digits.replace(".", ",") if layout.comma else digits
-    return (layout.separator or "").join(parts)
+    return (layout.separator or "").join(parts) + line[len(body) :]
 
 
 def _points(path: Path, text: str, layout: Layout) -> np.ndarray:
@@ -148,7 +189,7 @@ def _slowly(path: Path, text: str, layout: Layout) -> np.ndarray:
 
 def _counts(line: str, layout: Layout) -> bool:
     """Whether a line holds a number of points and nothing else."""
-    return layout.count is not None and line.strip().isdigit()
+    return layout.count is not None and is_count(line.strip())
 
 
 def _check_count(path: Path, announced: tuple[int | None, int, int], found: int) -> None:

@@ -99,8 +99,7 @@ def write_moved(
     with packed.unpacked(source) as file:
         own = _own_writer(kind, origin)
         if own is not None:
-            own(path, file, rotation, translation)
-            return ()
+            return own(path, file, rotation, translation) or ()
         if kind in mesh.SUFFIXES and (kind not in WRITERS or mesh.is_mesh(file)):
             mesh.write_moved(path, file, rotation, translation)
             moved = points @ rotation.T + translation

@@ -16,6 +16,8 @@ _PEERS: dict[str, ModuleType] = {
 }  # fmt: skip
 TRAINED = ("paper", "idam", "rpmnet", "fmr")
 """The networks that `train` trains; of the others there are weights of their authors."""
+_TRAINING_ONLY = {"fmr": "decoder"}
+"""Parts of `params` that a registration does not use, and which would be most of a file of weights."""
 
 
 def init_variables(key: PRNGKeyArray, config: Config) -> Variables:
@@ -23,6 +25,20 @@ def init_variables(key: PRNGKeyArray, config: Config) -> Variables:
     if config.network == "paper":
         return model.init_variables(key, config.model)
     return _PEERS[config.network].init_variables(key, getattr(config, config.network))
+
+
+def for_registration(variables: Variables, config: Config) -> Variables:
+    """`variables` without what only the training uses."""
+    left_out = _TRAINING_ONLY.get(config.network)
+    return variables | {"params": {k: x for k, x in variables["params"].items() if k != left_out}}
+
+
+def for_training(variables: Variables, fresh: Variables, config: Config) -> Variables:
+    """`variables` with what they lack because only the training uses it, from `fresh` ones."""
+    part = _TRAINING_ONLY.get(config.network)
+    lacks = part in fresh["params"] and part not in variables["params"]
+    added = {part: fresh["params"][part]} if lacks else {}
+    return variables | {"params": variables["params"] | added}
 
 
 def pose(

@@ -11,6 +11,9 @@ from jaxreg.scans.many import Alignment
 from jaxreg.scans.relation import Relation
 from jaxreg.scans.summary import plain
 
+_EXACT = 1e-6
+"""Nothing is known better: one standard deviation in radians, and in reaches."""
+
 
 def verdict(alignment: Alignment) -> str:
     """How many scans are placed, in how many groups, and how sure the least sure one is."""
@@ -89,7 +92,8 @@ def record(alignment: Alignment, names: list[str]) -> dict[str, Any]:
 def edges(alignment: Alignment) -> Edges:
     """The used pairs as edges of a pose graph, with their information, for g2o.
 
-    A covariance that is not known counts as 1. It is of a motion of the source's frame.
+    A covariance that is not known counts as 1. It is of a motion of the source's frame. What a
+    covariance says to be exact, as the motions out of the plane of planar scans, gets a floor.
     """
     used = [pair.relation for pair in alignment.pairs if pair.used]
     matrices = np.array([r.transformation for r in used]).reshape(-1, 4, 4)
@@ -106,10 +110,14 @@ def _information(relation: Relation, centre: np.ndarray) -> np.ndarray:
     """The information of a motion of the source's frame, from one about the reference's centre."""
     if not np.isfinite(relation.covariance).all():
         return np.eye(6)
-    away = np.eye(6)
-    away[3:, :3] = se3.skew(centre)
-    carried = se3.adjoint(se3.inverted(relation.transform)) @ away
-    return np.linalg.inv(carried @ relation.covariance @ carried.T)
+    reach = relation.max_correspondence_distance
+    floor = _EXACT * np.repeat([1.0, reach if reach > 0 else 1.0], 3)
+    information = np.linalg.inv(relation.covariance + np.diag(floor**2))
+    # Carried after the inversion: far from the origin the lever arms would drown the rest.
+    back = np.eye(6)
+    back[3:, :3] = -se3.skew(centre)
+    back = back @ se3.adjoint(relation.transform)
+    return back.T @ information @ back
 
 
 def listed(names: list[str], most: int) -> str:

@@ -1,8 +1,10 @@
 """The settings of `jaxreg.register`."""
 
 import dataclasses
+import math
 
-from jaxreg.refine.config import RefineConfig
+from jaxreg.geometry import arguments
+from jaxreg.refine.config import RefineConfig, check_options
 from jaxreg.search.config import SearchConfig
 
 
@@ -28,16 +30,39 @@ class RegisterConfig:
     """The refinement of the pose that the search finds, or of the start; None leaves it as it is. A
     pose that still moves at the end is refined on until it stands still."""
     search_points: int = 1024
-    """The search and the verdict use at most this many points of a cloud; larger clouds are
-    averaged in voxels."""
+    """The search, and the overlap that is told, use at most this many points of a cloud; larger clouds
+    are averaged in voxels."""
     refine_points: int = 4096
-    """The refinement uses at most this many points of a cloud."""
+    """The refinement and the verdict use at most this many points of a cloud."""
     learned: bool = False
-    """Match points by learned features, computed from the moments: finds 1 to 4 % more pairs at 70
-    % overlap, and takes a quarter longer."""
+    """Match points by learned features, computed from the moments: finds a few more crops, and takes
+    half as long again or more (RESULTS.md)."""
     inlier_spacings: float = 1.5
     """A point counts as overlapping within this many spacings of the other cloud (spacing after
     reduction to `search_points`)."""
     refine_spacings: float = 2.0
     """Largest distance of corresponding points in the refinement, in spacings of its clouds, unless
     `refine.max_correspondence_distance` is set."""
+
+
+_LEAST = {"search_points": 16, "refine_points": 16}
+"""The smallest allowed value of these settings; the others must be positive."""
+
+
+def checked(config: RegisterConfig | None) -> RegisterConfig:
+    """The settings, the defaults for None.
+
+    Raises:
+      ValueError: they are of another class, or one is out of range.
+    """
+    if config is None:
+        return RegisterConfig()
+    arguments.settings("config", config, RegisterConfig)
+    for name in ("search_points", "refine_points", "inlier_spacings", "refine_spacings"):
+        value, least = getattr(config, name), _LEAST.get(name, 0)
+        if not (least <= value < math.inf and value > 0):
+            bound = f"at least {least}" if least else "positive"
+            raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
+    if config.refine is not None:
+        check_options(config.refine)  # an error for any clouds, also where none is refined
+    return config

@@ -23,9 +23,9 @@ _OFF = 8.0
 _LEAST = 0.02
 """The noise is at least so many widths of a patch where the typical distance is looked at."""
 _ENOUGH, _SUSPECT = 0.8, 0.03
-"""If so many points can be compared and so many of them are off, the causes are looked for, which takes
-seconds. Of right poses of real scans (docs/notes/0045) those that overlap less often have as many off,
-where the scans end or depth is bent; those that overlap so far have not."""
+"""If so many points can be compared and so many of them are off, the causes are looked for, which
+takes up to a second. Of right poses of real scans (docs/notes/0045) those that overlap less often have
+as many off, where the scans end or depth is bent; those that overlap so far have not."""
 _SPREAD = 1.15
 """Of normal errors half are below 0.67; right poses of real scans have 0.6 to 1.1, one of 19 1.2."""
 _BETTER = 0.4

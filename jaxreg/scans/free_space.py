@@ -125,8 +125,19 @@ class Sides(NamedTuple):
         return np.clip(_SLOPE * (_USUAL - share), _MOST_AGAINST, _MOST_FOR)
 
 
-def check_place(place: object, name: str) -> Float[np.ndarray, "3"] | None:
+def contradiction(share: float) -> str:
+    """A sentence if so large a share of the points lies in front of what was measured; else empty."""
+    if share < CONTRADICTED:
+        return ""
+    return f"{share:.0%} of the points lie in front of what the other scanner measured there."
+
+
+def check_place(
+    place: object, name: str, *, height: float | None = None
+) -> Float[np.ndarray, "3"] | None:
     """A viewpoint (3,) as float64; None is unknown.
+
+    Two numbers are one in the plane of a cloud whose points all have the z `height`.
 
     Raises:
       ValueError: it is not three finite numbers.
@@ -137,6 +148,8 @@ def check_place(place: object, name: str) -> Float[np.ndarray, "3"] | None:
         array = np.asarray(place, np.float64)
     except (TypeError, ValueError):
         array = np.zeros(0)
+    if array.shape == (2,) and height is not None:
+        array = np.append(array, height)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise ValueError(
             f"the viewpoint of the {name} must be three finite numbers, where its scanner stood in the "
@@ -146,7 +159,12 @@ def check_place(place: object, name: str) -> Float[np.ndarray, "3"] | None:
 
 
 def places(viewpoint: object) -> tuple[object, object]:
-    """The viewpoints of source and reference: one is of both, a pair of one each."""
+    """The viewpoints of source and reference: one is of both, a pair of one each.
+
+    Two numbers are a place in the plane.
+    """
     if isinstance(viewpoint, tuple | list) and len(viewpoint) == 2:
-        return viewpoint[0], viewpoint[1]
+        one, other = viewpoint
+        if not (isinstance(one, int | float) and isinstance(other, int | float)):
+            return one, other
     return viewpoint, viewpoint

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from jaxreg.geometry import frame
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.judge.odds import chances
-from jaxreg.scans import candidates, prepare, surfaces
+from jaxreg.scans import candidates, masks, prepare, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
@@ -60,6 +60,19 @@ class Nested(NamedTuple):
     def with_whole(self, cloud: Prepared) -> tuple[Prepared, Prepared]:
         """Source and reference, with this cloud in the place of the large one."""
         return (cloud, self.reference) if self.large == 0 else (self.source, cloud)
+
+
+class Piece(NamedTuple):
+    """A part of the large cloud, and which of the points of the large cloud it has."""
+
+    cloud: Prepared
+    points: Bool[np.ndarray, "p"]
+
+    def problem(self, pair: Nested, config: RegisterConfig, known: Known) -> surfaces.Problem:
+        """The pair with this in the place of the large cloud, and with the weights of its points."""
+        if pair.large == 0 and known.weights is not None:
+            known = known._replace(weights=masks.of_points(known.weights[self.points], self.cloud))
+        return surfaces.pose_problem(*pair.with_whole(self.cloud), config, known)
 
 
 def is_possible(source: Prepared, reference: Prepared) -> bool:
@@ -116,7 +129,7 @@ def _judged(
     for pose in poses:
         if (piece := covered(pair, pose, config)) is None:
             continue
-        problem = surfaces.pose_problem(*pair.with_whole(piece), config, known)
+        problem = piece.problem(pair, config, known)
         here = frame.transform_in(problem.where, pose)
         found = candidates.judged(
             problem.clouds(),
@@ -155,7 +168,7 @@ def _found_in_tiles(
     """The poses that score best in the tiles of the large cloud, as poses of the clouds as given."""
     found: list[tuple[float, RigidTransform]] = []
     for tile in tiles(pair, config):
-        problem = surfaces.pose_problem(*pair.with_whole(tile), config, known)
+        problem = tile.problem(pair, config, known)
         poses, score = surfaces.searched_poses(problem, config.search, learned=False)
         for i in np.argsort(-score)[:_A_TILE]:
             pose = RigidTransform(poses.rotation[i], poses.translation[i])
@@ -164,7 +177,7 @@ def _found_in_tiles(
     return tuple(pose for _, pose in found[:_ALL_TILES])
 
 
-def covered(pair: Nested, pose: RigidTransform, config: RegisterConfig) -> Prepared | None:
+def covered(pair: Nested, pose: RigidTransform, config: RegisterConfig) -> Piece | None:
     """The part of the large cloud that the small one covers under a pose of the clouds as given.
 
     None if there is hardly any.
@@ -181,7 +194,7 @@ def covered(pair: Nested, pose: RigidTransform, config: RegisterConfig) -> Prepa
     )
 
 
-def tiles(pair: Nested, config: RegisterConfig) -> list[Prepared]:
+def tiles(pair: Nested, config: RegisterConfig) -> list[Piece]:
     """Pieces of the large cloud, each about as large as the small one, that overlap each other."""
     points = pair.whole.points * pair.whole.radius
     edge = _TILE * float(np.max(np.ptp(pair.part.points, axis=0))) * pair.part.radius
@@ -201,13 +214,11 @@ def tiles(pair: Nested, config: RegisterConfig) -> list[Prepared]:
     return found
 
 
-def _cut(whole: Prepared, inside: Bool[np.ndarray, "p"], config: RegisterConfig) -> Prepared | None:
-    """A cloud of these points, in the frame of the input."""
+def _cut(whole: Prepared, inside: Bool[np.ndarray, "p"], config: RegisterConfig) -> Piece | None:
+    """A cloud of these points, in the frame of the input; None if there are hardly any."""
     if np.sum(inside) < _FEWEST:
         return None
-    points = whole.points[inside] * whole.radius + whole.centre
-    across = None if whole.normals is None else whole.normals[inside]
-    return prepare.prepare(points, normals=across, strays="keep", config=config)
+    return Piece(prepare.of_points(whole, inside, config), inside)
 
 
 def _within_hull(

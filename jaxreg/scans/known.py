@@ -7,11 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxreg.geometry import se3
+from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.refine.uncertainty import PoseUncertainty
 from jaxreg.types import RigidTransform
 
 Fact = Literal["upright", "inside"]
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_ROUNDING_DEG = 1e-6
 
 
 class Known(NamedTuple):
@@ -57,6 +59,21 @@ class Known(NamedTuple):
             return pose
         angle = best_turn(np.asarray(pose.rotation)[None], self.up)
         return RigidTransform(turns_about(self.up, angle)[0], pose.translation)
+
+    def start(self, initial: RigidTransform) -> RigidTransform:
+        """`allowed` of a pose to start from.
+
+        Raises:
+          ValueError: it turns by more than `max_rotation_deg`.
+        """
+        pose = self.allowed(initial)
+        turned = float(rotation_angle_deg(pose.rotation, np.eye(3)))
+        if turned > self.max_rotation_deg + _ROUNDING_DEG:
+            raise ValueError(
+                f"initial turns by {turned:.4g} degrees, more than max_rotation_deg = "
+                f"{self.max_rotation_deg:g}: leave one of the two out."
+            )
+        return pose
 
 
 def known_of(

@@ -13,9 +13,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.geometry.clouds import check_pose
+from jaxreg.geometry.clouds import check_points, check_pose, pose_parts
 from jaxreg.scans import apart, placing, prepare, proposals, stored
-from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.scans.joint import JointRefinement, refine_jointly
 from jaxreg.scans.placing import Placement, Sizes
 from jaxreg.scans.prepare import Prepared, voxel_reduced
@@ -41,7 +41,7 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Pair:
+class AlignedPair:
     """A pair of scans that was registered: `relation`, and what became of it.
 
     `probability` is that of the pair in view of all others. `used` says whether the poses come from it
@@ -75,7 +75,7 @@ class Alignment:
     probability: Float[np.ndarray, "n"]
     covariance: Float[np.ndarray, "n 6 6"]
     centres: Float[np.ndarray, "n 3"]
-    pairs: tuple[Pair, ...]
+    pairs: tuple[AlignedPair, ...]
     reasons: tuple[str, ...]
     steps: tuple[JointRefinement, ...]
     notes: tuple[str, ...]
@@ -101,35 +101,45 @@ class Alignment:
         return tuple(np.flatnonzero(np.isnan(self.translation[:, 0])).tolist())
 
     def merged(
-        self, clouds: Sequence[np.ndarray], *, group: int = 0, voxel: float | None = None
+        self, clouds: Sequence[object], *, group: int = 0, voxel: float | None = None
     ) -> tuple[Float[np.ndarray, "p 3"], np.ndarray]:
         """The points of a group in its frame, and of each the number of its scan.
 
-        `clouds` are those that were registered. With `voxel`, points of one scan in one cube of this
-        edge become their mean.
+        `clouds` are those that were registered, arrays or prepared ones; rows that are not finite are
+        left out. With `voxel`, points of one scan in one cube of this edge become their mean.
 
         Raises:
-          ValueError: there is no such group, or `voxel` is not positive.
+          ValueError: there is no such group, `clouds` are not as many as the scans, one of them is no
+            cloud, or `voxel` is not positive.
         """
         if not 0 <= group < len(self.groups):
             raise ValueError(f"there is no group {group}: there are {len(self.groups)}.")
         if voxel is not None and not voxel > 0:
             raise ValueError(f"voxel must be positive, got {voxel}.")
-        parts = []
-        for k in self.groups[group]:
-            points = np.asarray(clouds[k], np.float64)
-            points = points[np.isfinite(points).all(axis=1)]
-            parts.append(points @ self.rotation[k].T + self.translation[k])
+        if len(clouds) != len(self.translation):
+            raise ValueError(f"{len(clouds)} clouds for {len(self.translation)} scans: give all.")
+        parts = [
+            _points_of(clouds[k], f"scan {k}") @ self.rotation[k].T + self.translation[k]
+            for k in self.groups[group]
+        ]
         if voxel is not None:
             parts = [voxel_reduced(part, voxel) for part in parts]
         return np.concatenate(parts), np.repeat(self.groups[group], [len(p) for p in parts])
+
+
+def _points_of(cloud: object, name: str) -> Float[np.ndarray, "n 3"]:
+    """The finite points of a cloud as `register_many` takes it, in the unit of the input."""
+    if isinstance(cloud, Prepared):
+        return cloud.points[cloud.row] * cloud.radius + cloud.centre
+    points, finite = check_points(cloud, name, nonfinite="drop", planar=True)
+    return points[finite]
 
 
 def register_many(
     clouds: Sequence[object],
     *,
     order: Literal["unknown", "sequence"] | Sequence[float] = "unknown",
-    initial: Sequence[object] | None = None,
+    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | None = None,
     viewpoints: Sequence[object] | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
@@ -147,8 +157,8 @@ def register_many(
     `order` "sequence" neighbours in the list overlap, and only these and closures of loops are
     looked for; an `order` of numbers, one a scan, are the times at which the scans were taken (any
     unit): neighbours are then those in time, unless ten times the usual step lies between them.
-    `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None), all in one
-    frame. `viewpoints` say where the scanner of each scan stood (3,), in the coordinates of the
+    `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None; NaN is None), all in
+    one frame. `viewpoints` say where the scanner of each scan stood (3,), in the coordinates of the
     scan, None where unknown: see `jaxreg.prepare`. `joint` refines all poses together at the end.
     With `work`, a folder, prepared scans and finished pairs are kept there, and a run with the same
     scans and settings goes on where the last one ended. Pairs run on `executor` (any of
@@ -160,7 +170,7 @@ def register_many(
       ValueError: fewer than two clouds, a cloud that `jaxreg.prepare` refuses, or an option that is
         wrong.
     """
-    config = RegisterConfig() if config is None else config
+    config = checked(config)
     names = _checked_names(clouds, names)
     starts = _checked_starts(initial, len(clouds))
     times = _checked_times(order, len(clouds))
@@ -216,18 +226,21 @@ def _checked_times(order: object, count: int) -> Float[np.ndarray, "n"] | None:
     return times.astype(np.float64)
 
 
-def _checked_starts(initial: Sequence[object] | None, count: int) -> list[np.ndarray | None]:
+def _checked_starts(
+    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | None, count: int
+) -> list[np.ndarray | None]:
     if initial is None:
         return [None] * count
     if len(initial) != count:
         raise ValueError(f"{len(initial)} initial poses for {count} scans: give one each, or None.")
     starts: list[np.ndarray | None] = []
     for k, pose in enumerate(initial):
-        if pose is None:
+        given = None if pose is None else pose_parts(pose, f"initial[{k}]")
+        # As `Alignment.transformation` has it for a scan that was not placed.
+        if given is None or all(np.isnan(part).all() for part in given):
             starts.append(None)
-            continue
-        checked = check_pose(pose, f"initial[{k}]")
-        starts.append(matrix_of(checked))
+        else:
+            starts.append(matrix_of(check_pose(RigidTransform(*given), f"initial[{k}]")))
     return starts
 
 
@@ -251,7 +264,11 @@ class _Run(NamedTuple):
         )
 
     def do(self, tasks: list[Task], text: str) -> None:
-        """Register these pairs; the better result replaces an earlier one of the same pair."""
+        """Register these pairs; of a pair that was registered before one result stays.
+
+        That is the later one if its probability is higher, or if the earlier one is of the first search
+        alone: what is looked for again was in doubt.
+        """
         done, wanted = len(self.relations), len(self.relations) + len(tasks)
         found = []
         for k, relation in enumerate(self.runner(tasks)):
@@ -493,7 +510,7 @@ def _pair_path(folder: WorkFolder, task: Task, prints: list[str]) -> Path:
 
 def _alignment(placement: Placement, run: _Run, steps) -> Alignment:
     pairs = tuple(
-        Pair(relation, float(chance), bool(used), reason)
+        AlignedPair(relation, float(chance), bool(used), reason)
         for relation, chance, used, reason in zip(
             run.relations, placement.posterior, placement.used, placement.refusal, strict=True
         )
@@ -509,7 +526,7 @@ def _alignment(placement: Placement, run: _Run, steps) -> Alignment:
     )  # fmt: skip
 
 
-def _why_alone(scan: int, pairs: tuple[Pair, ...], names: list[str]) -> str:
+def _why_alone(scan: int, pairs: tuple[AlignedPair, ...], names: list[str]) -> str:
     """The reason of the most probable of its pairs."""
     own = [p for p in pairs if scan in (p.relation.source, p.relation.reference)]
     if not own:

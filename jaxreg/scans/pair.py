@@ -5,11 +5,9 @@ from typing import Literal
 
 import numpy as np
 
-from jaxreg.geometry import arguments
 from jaxreg.geometry.clouds import check_pose
-from jaxreg.refine.config import check_options
 from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
-from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import ScanRegistration, widened
@@ -42,7 +40,8 @@ def register(
 
     `initial` (4x4 or a `RigidTransform`) starts from a known pose. The search is skipped, so
     `alternatives` is empty and the verdict does without rival poses. `max_rotation_deg` is the
-    largest rotation to consider (None: any); it decides between the poses of a symmetric shape.
+    largest rotation to consider (None: any); it decides between the poses of a symmetric shape, and
+    bounds a start, but not its refinement.
     `known` says what is known of the pair: "upright", both scans have the axis `up` ("x", "y", "z"
     or a vector) upwards, so that the source is turned about it alone; "inside", the source lies
     wholly in the reference, which shows far more; or both. With `scale` the size of the source is
@@ -50,21 +49,21 @@ def register(
 
     `mask` (n,) of booleans leaves out points of the source that are known to have moved; a pair of
     masks is of both clouds. `weights` (n,) say how much the points of the source count in the last
-    stage. `viewpoint` (3,) is where the scanner of each cloud stood, in the cloud's own
-    coordinates; a pair of them is of source and reference, None of an unknown one. Poses that put
-    points between a scanner and what it measured are then held to be wrong. `nonfinite` and
-    `strays` say what to do with rows that are NaN or infinite, and with a few points that lie ten
-    times as far from the middle as all others. The same input gives the same bits on as many cores.
+    stage; of at most 60 points all count alike. `viewpoint` (3,) is where the scanner of each cloud
+    stood, in the cloud's own coordinates; a pair of them is of source and reference, None of an
+    unknown one. Poses that put points between a scanner and what it measured are then held to be
+    wrong. `nonfinite` and `strays` say what to do with rows that are NaN or infinite, and with a few
+    points that lie ten times as far from the middle as all others. The same input gives the same bits
+    on one machine with as many cores.
 
     Raises:
       ValueError: a cloud is not a numeric (n, 3) array with at least three finite points (the
-        message names the row), `initial` is not rigid, an option is out of range, or a cloud was
-        prepared with another configuration.
+        message names the row), `initial` is not rigid or turns too far, an option is out of range, or a
+        cloud was prepared with another configuration.
     """
-    config = RegisterConfig() if config is None else config
-    _check_options(config)
+    config = checked(config)
     facts = known_of(known, up, max_rotation_deg)
-    start = None if initial is None else facts.allowed(check_pose(initial, "initial"))
+    start = None if initial is None else facts.start(check_pose(initial, "initial"))
     first, second = (
         prepare.prepared(
             cloud,
@@ -144,6 +143,11 @@ def _of_one_size(
 ) -> ScanRegistration:
     """Every kind of pair has a module of its own; here one is chosen."""
     if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
+        if known.weights is not None and np.ptp(known.weights) > 0:
+            raise ValueError(
+                "weights need surfaces or lines, and of at most 60 points all that agree count alike: "
+                "give a mask of those that take part."
+            )
         return found
     if planar.is_planar(source, reference):
         return planar.registered(source, reference, config, start, known)
@@ -169,18 +173,3 @@ def _check_dimensions(given: tuple[object, object], clouds: tuple[Prepared, Prep
         f"{name} has shape {shapes[0 if flat[0] else 1]}, two coordinates a point, and {other} has "
         "three: give both as (n, 2) or both as (n, 3)."
     )
-
-
-_LEAST = {"search_points": 16, "refine_points": 16}
-"""The smallest allowed value of these settings; the others must be positive."""
-
-
-def _check_options(config: RegisterConfig) -> None:
-    arguments.settings("config", config, RegisterConfig)
-    for name in ("search_points", "refine_points", "inlier_spacings", "refine_spacings"):
-        value, least = getattr(config, name), _LEAST.get(name, 0)
-        if not (least <= value < np.inf and value > 0):
-            bound = f"at least {least}" if least else "positive"
-            raise ValueError(f"config.{name} must be {bound} and finite, got {value}.")
-    if config.refine is not None:
-        check_options(config.refine)  # an error for any clouds, also where none is refined

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxreg.geometry import clouds as checks
 from jaxreg.geometry import trees
@@ -20,6 +20,7 @@ from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, weak_directions
 from jaxreg.scans import candidates, correlation, planes, verdict
 from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.free_space import Sides, contradiction
 from jaxreg.scans.known import Known, turns_about
 from jaxreg.scans.prepare import Prepared, reduce_to
 from jaxreg.scans.result import (
@@ -64,11 +65,15 @@ _ALIKE, _RAREST = 0.95, 0.02
 
 
 class Line(NamedTuple):
-    """A cloud in the plane, around its centre in units of its radius, at two densities, indexed."""
+    """A cloud in the plane, around its centre in units of its radius, at two densities, indexed.
+
+    `nearest_point` is the number of the nearest point of the cloud itself.
+    """
 
     points: Float[np.ndarray, "n 3"]
     surface: planes.Surface
     normals: Float[np.ndarray, "n 3"]
+    nearest_point: Int[np.ndarray, "n"]
     judged: Float[np.ndarray, "j 3"]
     judged_tree: trees.Tree
     examined: Examined
@@ -101,7 +106,10 @@ def registered(
         fits = [_refined(x, y, ratio, in_unit(inner, 1 / reference.radius), _START, config)]
     poses = _stacked([fit.pose for fit in fits])
     evidence, score = _judged(x, y, ratio, poses)
-    ranked = candidates.ranked(poses, evidence, score)
+    free_space = Sides(
+        (source.view, reference.view), (source.coarse.points, reference.coarse.points), (ratio, 1.0)
+    )
+    ranked = candidates.ranked(poses, evidence, score + free_space.log_odds(poses))
     turned = np.abs(np.arctan2(ranked.poses.rotation[:, 1, 0], ranked.poses.rotation[:, 0, 0]))
     best = int(np.argmax(ranked.score - candidates.TURN_COST * turned / np.pi))
     order = [best, *(i for i in range(len(ranked.score)) if i != best)]
@@ -110,13 +118,15 @@ def registered(
     )
     chances = chances_of(ranked.score[order])
     judged = jax.tree.map(lambda leaf: float(leaf[best]), ranked.evidence)
-    fit = _closed(x, y, ratio, pose, config)
+    weights = None if known.weights is None else known.weights[x.nearest_point]
+    fit = _closed(x, y, ratio, pose, config, weights)
     accuracy = _accuracy(fit, reference, config)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])
     rivals = chances[1:]
     success = verdict.is_success(chance, rivals, accuracy.converged)
-    reason = "" if success else _reason(judged, accuracy, float(rivals.sum()))
+    in_front = float(free_space.share_in_front(_stacked([fit.pose]))[0])
+    reason = "" if success else _reason(judged, accuracy, float(rivals.sum()), in_front)
     spacing = max(
         float(x.examined.spacing) * source.radius, float(y.examined.spacing) * reference.radius
     )
@@ -142,11 +152,15 @@ def _line(cloud: Prepared) -> Line:
     surface = planes.Surface(points, tree, count=_NEIGHBORS, flat=True)
     normals = cloud.fine.normals
     normals = surface.next_to(points).normal if normals is None else normals
+    nearest_point = trees.nearest(cloud.tree, cloud.fine.points)[1]
     judged = reduce_to(points, _JUDGED)
     noise = planes.patches(points, tree, judged, count=_NEIGHBORS, flat=True).noise
     judged_tree = trees.Tree(judged)
     examined = _examined(judged, judged_tree, cloud)
-    return Line(points, surface, normals, judged, judged_tree, examined, float(np.median(noise)))
+    return Line(
+        points, surface, normals, nearest_point, judged, judged_tree, examined,
+        float(np.median(noise)),
+    )  # fmt: skip
 
 
 def _examined(points: Float[np.ndarray, "j 3"], tree: trees.Tree, cloud: Prepared) -> Examined:
@@ -204,18 +218,27 @@ def _refined(
 
 
 def _closed(
-    x: Line, y: Line, ratio: float, pose: RigidTransform, config: RegisterConfig
+    x: Line,
+    y: Line,
+    ratio: float,
+    pose: RigidTransform,
+    config: RegisterConfig,
+    weights: Float[np.ndarray, "n"] | None,
 ) -> planes.Fitted:
-    """The chosen pose, refined with all points of the line."""
-    at = _fitted(x.points * ratio, y, pose, np.zeros(0))
-    if config.refine is None:
-        return at
+    """The chosen pose, refined with all points of the line as much as they count."""
     width = planes.TUKEY * max(_noise(x, y, ratio), 1e-6)
-    return _fitted(x.points * ratio, y, pose, np.full(_STEADY, width))
+    widths = np.zeros(0) if config.refine is None else np.full(_STEADY, width)
+    return _fitted(x.points * ratio, y, pose, widths, weights)
 
 
-def _fitted(points: np.ndarray, y: Line, pose: RigidTransform, widths: np.ndarray) -> planes.Fitted:
-    return planes.fitted(points, y.surface, pose, widths, motions=MOTIONS)
+def _fitted(
+    points: np.ndarray,
+    y: Line,
+    pose: RigidTransform,
+    widths: np.ndarray,
+    weights: Float[np.ndarray, "n"] | None = None,
+) -> planes.Fitted:
+    return planes.fitted(points, y.surface, pose, widths, motions=MOTIONS, weights=weights)
 
 
 def _noise(x: Line, y: Line, ratio: float) -> float:
@@ -289,13 +312,13 @@ def _overlap(x: Line, y: Line, ratio: float, pose: RigidTransform, within: float
     return float(np.mean(np.concatenate([there, here]) < within))
 
 
-def _reason(judged: Evidence, accuracy: Accuracy, rivals: float) -> str:
+def _reason(judged: Evidence, accuracy: Accuracy, rivals: float, in_front: float) -> str:
     if accuracy.weak_directions:
         names = ", ".join(direction.name for direction in accuracy.weak_directions)
         return f"The lines leave the pose free: {names}."
     if accuracy.converged is False:
         return "The pose was still moving at the end of the refinement."
-    return verdict.reason(judged, (), rivals)
+    return contradiction(in_front) or verdict.reason(judged, (), rivals)
 
 
 def _stacked(poses: list[RigidTransform]) -> RigidTransform:

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxreg._xla import from_host
-from jaxreg.geometry import arguments, frame, trees
+from jaxreg.geometry import frame, trees
 from jaxreg.geometry.clouds import check_normals, check_points, padded
 from jaxreg.judge.surface import Examined, examine
 from jaxreg.refine.kdtree import IndexedCloud, index_cloud
 from jaxreg.scans import free_space, planes
 from jaxreg.scans import strays as stray_points
-from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
 
@@ -32,6 +32,8 @@ FINEST = 1e-6
 """The resolution of float32 in a cloud of radius 1: a smaller spacing counts as zero."""
 _CUBES = 1 << 20
 """Up to this many cubes, a table of all of them is faster than sorting the occupied ones."""
+_GUESSES, _CLOSE = 12, 1.02
+"""Sizes tried from the number of occupied voxels, and how near to the smallest the last one is."""
 _STEPS = 4
 """Units and densities that pairs are compared at, per factor of two."""
 _UNALIKE = 1.3
@@ -158,10 +160,10 @@ def prepare(
     """Compute once what registration needs to know about a cloud; give it to `jaxreg.register`.
 
     `cloud` is array-like (n, 3), or (n, 2) in the plane z = 0. `normals` (n, 3), of any length and
-    sign, replace the computed ones; give zeros where unknown. `viewpoint` (3,) is where the scanner
-    stood: a pose that puts points between it and what it measured is then held to be wrong. Give it
-    only for a cloud that was seen from one place. `strays` are a few points ten times as
-    far from the middle as all others (`Prepared.notes` tells of them): they are left out, take part,
+    sign, replace the computed ones; give zeros where unknown. `viewpoint` (3,), or (2,) in the plane,
+    is where the scanner stood: a pose that puts points between it and what it measured is then held
+    to be wrong. Give it only for a cloud that was seen from one place. `strays` are a few points ten
+    times as far from the middle as all others (`Prepared.notes` tells of them): they are left out, take part,
     or are an error; centre and radius are those of the others in any case. `config` must be that of
     the registration, and `name` is how messages refer to the cloud.
 
@@ -171,11 +173,12 @@ def prepare(
         there are strays
         and `strays` is "raise".
     """
-    config = RegisterConfig() if config is None else config
-    arguments.settings("config", config, RegisterConfig)
+    config = checked(config)
     array, kept = check_points(cloud, name, nonfinite=nonfinite, planar=True)
     across = None if normals is None else check_normals(normals, kept, name)
-    place = free_space.check_place(viewpoint, name)
+    heights = array[kept, 2]
+    height = float(heights[0]) if np.ptp(heights) == 0 else None
+    place = free_space.check_place(viewpoint, name, height=height)
     far, notes = _strays(array[kept], strays, name)
     if strays == "drop":
         kept[kept] = ~far
@@ -229,7 +232,15 @@ def part(cloud: Prepared, rows: Bool[np.ndarray, "n"], config: RegisterConfig) -
 
     Its own rows are those that are left.
     """
-    chosen = cloud.row[rows[cloud.kept]]
+    return of_points(cloud, cloud.row[rows[cloud.kept]], config)
+
+
+def of_points(
+    cloud: Prepared,
+    chosen: Int[np.ndarray, "m"] | Bool[np.ndarray, "p"],
+    config: RegisterConfig,
+) -> Prepared:
+    """The cloud of these of its points, which are the rows of the new one, with its viewpoint."""
     points = cloud.points[chosen] * cloud.radius + cloud.centre
     across = None if cloud.normals is None else cloud.normals[chosen]
     place = None if cloud.viewpoint is None else cloud.viewpoint * cloud.radius + cloud.centre
@@ -280,21 +291,30 @@ def reduce_to(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, 
         return points
     columns = _from_corner(points)
     low, high = 0.0, max(float(column.max()) for column in columns)
-    chosen = np.zeros(len(points), np.int64)
-    size = high / np.sqrt(most)
-    for _ in range(12):
-        cubes = _cubes(columns, size)
-        count = int(np.count_nonzero(np.bincount(cubes)))
+    size, best = high / np.sqrt(most), None
+    for _ in range(_GUESSES):
+        cubes, count = _counted(columns, size)
         if count > most:
             low = size
         else:
-            high, chosen = size, cubes
+            high, best = size, cubes
             if count > 0.92 * most:
                 break
         # A surface has about 1 / size^2 occupied voxels.
         guess = size * np.sqrt(count / (0.96 * most))
         size = guess if low < guess < high else (low + high) / 2
-    return _means(points, chosen)
+    if best is None:
+        # Of evenly spaced points, hardly more than `most`, no two share a cube that is smaller than
+        # their spacing: there the guesses grow by a few per cent only.
+        best = _cubes(columns, high)  # two an axis at most, eight in all
+        while high > _CLOSE * low:
+            size = math.sqrt(low * high)
+            cubes, count = _counted(columns, size)
+            if count > most:
+                low = size
+            else:
+                high, best = size, cubes
+    return _means(points, best)
 
 
 def spacing(points: Float[np.ndarray, "n 3"], tree: trees.Tree | None = None) -> float:
@@ -391,6 +411,12 @@ def _cubes(columns: list[np.ndarray], size: float) -> Int[np.ndarray, "n"]:
         extent = [len(values) for values, _ in ranked]
     key = (cells[0] * extent[1] + cells[1]) * extent[2] + cells[2]
     return np.unique(key, return_inverse=True)[1] if math.prod(extent) > _CUBES else key
+
+
+def _counted(columns: list[np.ndarray], size: float) -> tuple[Int[np.ndarray, "n"], int]:
+    """`_cubes`, and how many of them have points."""
+    cubes = _cubes(columns, size)
+    return cubes, int(np.count_nonzero(np.bincount(cubes)))
 
 
 def _means(points: np.ndarray, group: Int[np.ndarray, "n"]) -> Float[np.ndarray, "v 3"]:

@@ -40,10 +40,14 @@ def most_alike(likeness: Float[np.ndarray, "n n"], most: int) -> set[tuple[int, 
 
 
 def successive(times: Float[np.ndarray, "n"]) -> set[tuple[int, int]]:
-    """Of every scan the next one in time and the one after that, unless a pause lies between."""
+    """Of every scan the next one in time and the one after that, unless a pause lies between.
+
+    Of the usual step only positive ones tell: several scanners may take scans at the same time.
+    """
     order = np.argsort(times, kind="stable")
     steps = np.diff(times[order])
-    part = np.concatenate([[0], np.cumsum(steps > _PAUSE * np.median(steps))])
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+    part = np.concatenate([[0], np.cumsum(steps > _PAUSE * usual)])
     return {
         (min(i, j), max(i, j))
         for step in (1, 2)

@@ -381,12 +381,8 @@ def _reason(
 
 def _contradiction(problem: Problem, pose: RigidTransform) -> str:
     """A sentence if free space speaks against the pose."""
-    share = float(
-        problem.free_space().share_in_front(jax.tree.map(lambda leaf: leaf[None], pose))[0]
-    )
-    if share < free_space.CONTRADICTED:
-        return ""
-    return f"{share:.0%} of the points lie in front of what the other scanner measured there."
+    poses = jax.tree.map(lambda leaf: leaf[None], pose)
+    return free_space.contradiction(float(problem.free_space().share_in_front(poses)[0]))
 
 
 def _overlap(problem: Problem, pose: RigidTransform) -> float:

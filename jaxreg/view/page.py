@@ -31,9 +31,11 @@ def write_registration_page(
 ) -> None:
     """Write an HTML page: both clouds, a before/after switch, confidence colours, numbers, verdict.
 
-    Where other poses may be right, one can step through them. Points that are not finite are left
-    out. Large clouds are thinned evenly for display.
+    Where other poses may be right, one can step through them. A source at another size is shown at
+    that of the reference from the start. Points that are not finite are left out. Large clouds are
+    thinned evenly for display.
     """
+    source = source * result.scale
     rows = shown_rows(source)
     origin = middle(reference)
     shift = brought_near(source[rows], reference[shown_rows(reference)])
@@ -78,6 +80,7 @@ def draw_registration(
     """
     from jaxreg.view.pictures import plot_pair  # matplotlib, which the page does not need
 
+    source = source * result.scale
     rows = shown_rows(source)
     moving, fixed = source[rows], _shown(reference)
     shift = brought_near(moving, fixed)
@@ -103,10 +106,16 @@ def _headline(result: ScanRegistration, source: np.ndarray, *, shortened: bool) 
 def write_content(path: str | Path, title: str, content: dict[str, Any]) -> None:
     """Write the page of a content: `clouds`, `motion`, `figures`, and what else the viewer knows."""
     template = (resources.files("jaxreg.view") / "viewer.html").read_text("utf-8")
+    title = encodable(title)
     # "</script" would end the element that holds the data, "<!--" could swallow its end.
     data = json.dumps(content).replace("<", "\\u003c")
     page = template.replace("{{title}}", html.escape(title)).replace("{{data}}", data)
     Path(path).write_text(page, encoding="utf-8")
+
+
+def encodable(name: str) -> str:
+    """A name as it can be written: bytes of a file's name that are not UTF-8 become question marks."""
+    return name.encode("utf-8", "replace").decode("utf-8")
 
 
 def packed_cloud(

@@ -32,7 +32,15 @@ _VARIABLE = "JAXREG_WEIGHTS"
 def available_weights() -> tuple[str, ...]:
     """Names for `load_pretrained`: networks shipped with the package or found in $JAXREG_WEIGHTS."""
     names = {card.stem for folder in _folders() for card in folder.glob("*.json")}
-    return tuple(sorted(name for name in names if "model" in load_card(name).get("config", {})))
+    return tuple(sorted(name for name in names if _is_network(name)))
+
+
+def _is_network(name: str) -> bool:
+    """Whether a JSON file of this name is a network's card; other files may lie beside weights."""
+    try:
+        return "model" in load_card(name)["config"]
+    except ValueError:
+        return False
 
 
 def load_pretrained(name: str = "modelnet40") -> tuple[dict[str, Any], Config]:
@@ -74,13 +82,13 @@ def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """
     from jaxreg.io.arrays import read_arrays  # and with it every format of clouds
 
-    path = _find(name).with_suffix(".npz")
+    path, _ = weight_files(name)
     return read_arrays(path, remedy="copy it again, or train again"), load_card(name)
 
 
 def load_card(name: str) -> dict[str, Any]:
     """How the weights were made: `command`, `data`, `config`; raises what `load_arrays` raises."""
-    path = _find(name).with_suffix(".json")
+    _, path = weight_files(name)
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -133,13 +141,17 @@ def _folders() -> list[Path]:
     return [_SHIPPED, *(Path(folder) for folder in own if folder)]
 
 
-def _find(name: str) -> Path:
-    """The path of the card of `name`, which may itself be a path without a suffix."""
+def weight_files(name: str) -> tuple[Path, Path]:
+    """The arrays and the card of `name`, which may itself be their path without a suffix.
+
+    Raises:
+      ValueError: there are no such weights (the message lists the names).
+    """
     is_path = Path(name).name != name
     for folder in [Path()] if is_path else _folders():
-        path = folder / f"{name}.json"
-        if path.is_file():
-            return path
+        arrays, card = folder / f"{name}.npz", folder / f"{name}.json"
+        if arrays.is_file() and card.is_file():
+            return arrays, card
     if is_path:
         raise ValueError(
             f"{name}.npz and {name}.json not found: give their common path without a suffix."

@@ -1,5 +1,7 @@
 """The second call: clouds of the size that is asked for, ratios by pair, and a process that times."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -43,3 +45,10 @@ def test_a_fresh_process_times_every_pair(tmp_path, seed):
         assert all(0 < x < 60 for x in taken)
     with pytest.raises(RuntimeError, match="nothing of"):
         second_call.seconds("nothing", tmp_path / "clouds.npz", processes.ROOT)
+
+
+def test_a_process_that_fails_says_what_it_wrote():
+    """On either stream, as a command of the shell and a script of Python do."""
+    code = "import sys; print('read', input()); sys.exit('no such cloud')"
+    with pytest.raises(RuntimeError, match="failed with 7 points:\nread 7 points\nno such cloud"):
+        processes.finished([sys.executable, "-c", code], environment={}, given="7 points")

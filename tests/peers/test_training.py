@@ -1,15 +1,17 @@
 """The peers that are trained here go through the same training, checkpoints and evaluation."""
 
+import chex
 import jax
 import numpy as np
 import pytest
 
 from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
 from jaxreg.evaluation import methods
-from jaxreg.peers import by_name
-from jaxreg.training import train
+from jaxreg.peers import by_name, fmr
+from jaxreg.training import create_train_state, release, started_from, train
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from jaxreg.weights.checkpoint import load_checkpoint
+from jaxreg.weights.released import load_pretrained
 from tests.peers.small import SMALL
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
@@ -36,6 +38,33 @@ def test_two_steps_a_checkpoint_and_a_method(name, tmp_path):
     still = RigidTransform(np.eye(3)[None], np.zeros((1, 3)))
     found = methods.choose(f"checkpoint:{tmp_path}").batch(Pair(cloud, cloud, still))
     np.testing.assert_allclose(found.rotation[0] @ found.rotation[0].T, np.eye(3), atol=1e-5)
+
+
+def test_weights_are_released_without_what_only_the_training_uses(tmp_path):
+    config = Config(
+        network="fmr",
+        fmr=SMALL["fmr"],
+        data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
+        pairs=PairConfig(points=32, kept=24),
+        test_pairs=PairConfig(points=32, kept=24),
+        train=TrainConfig(steps=1, batch=1, validate_every=1, validation_pairs=1),
+    )
+    trained = train(config, tmp_path / "run")
+    place = release("own", tmp_path / "run", "command", directory=tmp_path).with_suffix("")
+    released, _ = load_pretrained(str(place))
+    assert set(trained["params"]) - set(released["params"]) == {"decoder"}
+    points = np.random.default_rng(0).uniform(-1, 1, (2, 24, 3)).astype(np.float32)
+    for both in zip(
+        *(jax.tree.leaves(fmr.register(x, *points, config=config)) for x in (trained, released)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(*both)
+    state = create_train_state(config)
+    started = started_from(str(place), state).variables["params"]
+    for name, expected in (("encoder", trained), ("steps", trained), ("decoder", state.variables)):
+        chex.assert_trees_all_equal(started[name], expected["params"][name])
+    with pytest.raises(ValueError, match="do not fit the network of the configuration"):
+        started_from(str(place), create_train_state(Config(network="idam", idam=SMALL["idam"])))
 
 
 def test_a_network_that_is_not_trained_here_says_so(tmp_path):

@@ -178,3 +178,12 @@ def test_a_rough_pose_decides_between_alternatives(rng):
     start[:3, :3], start[:3, 3] = near, [10.1, 20.1, 0]
     found = register(layout, reference, initial=start)
     np.testing.assert_allclose(found.rotation, half.as_matrix(), atol=1e-6)
+
+
+def test_weights_of_a_few_points_are_refused(rng):
+    source = targets(rng, 8)
+    reference, _ = turned(rng, source)
+    with pytest.raises(ValueError, match="weights need surfaces or lines"):
+        register(source, reference, weights=np.arange(1.0, 9))
+    left_out = np.r_[np.zeros(2), np.ones(6)]
+    assert register(source, reference, weights=left_out).evidence.of == 6

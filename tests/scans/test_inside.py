@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.scans import inside, prepare
 from jaxreg.scans.config import RegisterConfig
+from jaxreg.scans.known import Known
 from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
 from tests.scenes import angle_deg, moved
@@ -41,7 +42,7 @@ def test_what_the_small_one_covers_is_cut():
     small = rng.uniform(20, 40, (2000, 3))
     turn, shift = Rotation.from_euler("z", 30, degrees=True).as_matrix(), np.array([5.0, 6, 7])
     pair = inside.Nested(prepared((small - shift) @ turn), prepared(large), 1)
-    piece = inside.covered(pair, RigidTransform(turn, shift), CONFIG)
+    piece = inside.covered(pair, RigidTransform(turn, shift), CONFIG).cloud
     got = piece.points * piece.radius + piece.centre
     core = np.all((large > 21) & (large < 39), axis=1).sum()
     assert core <= len(got)
@@ -56,17 +57,36 @@ def test_the_large_one_may_be_the_source():
     large, small = rng.uniform(0, 100, (20_000, 3)), rng.uniform(20, 40, (2000, 3))
     turn, shift = Rotation.from_euler("x", 50, degrees=True).as_matrix(), np.array([1.0, 2, 3])
     pair = inside.Nested(prepared(large), prepared(moved(small, turn, shift)), 0)
-    piece = inside.covered(pair, RigidTransform(turn, shift), CONFIG)
+    piece = inside.covered(pair, RigidTransform(turn, shift), CONFIG).cloud
     got = piece.points * piece.radius + piece.centre
     assert got.min() > 18
     assert got.max() < 42
+
+
+def test_a_piece_keeps_the_weights_of_its_points_and_where_it_was_seen_from():
+    rng = np.random.default_rng(4)
+    large, small = rng.uniform(0, 100, (20_000, 3)), rng.uniform(20, 40, (2000, 3))
+    whole = prepare.prepare(large, viewpoint=[50.0, 60, 70], strays="keep", config=CONFIG)
+    pair = inside.Nested(whole, prepared(small), 0)
+    piece = inside.covered(pair, RigidTransform(np.eye(3), np.zeros(3)), CONFIG)
+    weight = whole.points[:, 0] * whole.radius + whole.centre[0]  # of a point: its x
+    known = Known(weights=weight)
+    found = piece.problem(pair, CONFIG, known)
+    cut = found.source
+    assert cut.points.shape[0] < 2000
+    expected = cut.points[:, 0] * cut.radius + cut.centre[0]
+    np.testing.assert_allclose(found.known.weights, expected, atol=1e-9)
+    np.testing.assert_allclose(cut.viewpoint * cut.radius + cut.centre, [50, 60, 70], atol=1e-9)
 
 
 def test_tiles_cover_the_large_one_and_each_holds_the_small_one():
     rng = np.random.default_rng(2)
     large = rng.uniform(0, 1, (30_000, 3)) * [100, 60, 4]
     pair = inside.Nested(prepared(rng.uniform(0, 20, (2000, 3)) * [1, 1, 0.2]), prepared(large), 1)
-    seen = [tile.points * tile.radius + tile.centre for tile in inside.tiles(pair, CONFIG)]
+    seen = [
+        tile.cloud.points * tile.cloud.radius + tile.cloud.centre
+        for tile in inside.tiles(pair, CONFIG)
+    ]
     everything = np.unique(np.round(np.concatenate(seen), 6), axis=0)
     assert len(everything) == len(large)
     for corner in rng.uniform(0, [80, 40], (20, 2)):

@@ -79,3 +79,11 @@ def test_level_scans_are_turned_about_the_axis(up, seed):
     across = np.linalg.svd(axis[None])[2][1:]
     np.testing.assert_allclose(across @ found.covariance[:3], 0, atol=1e-9)
     assert found.success
+
+
+def test_a_start_beyond_the_limit_is_refused():
+    cloud = shapes.sample_shape(5, 10, points=300).astype(np.float64)
+    start = np.eye(4)
+    start[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    with pytest.raises(ValueError, match="initial turns by 90 degrees, more than max_rotation_deg"):
+        register(cloud, cloud, initial=start, max_rotation_deg=30)

@@ -70,6 +70,38 @@ def test_merged_cloud_has_the_points_of_the_group(scans, alignment):
         alignment.merged(scans[0], group=1)
 
 
+def test_merged_takes_what_was_registered(scans, alignment):
+    """Arrays with rows that are NaN, prepared clouds, and clouds in the plane."""
+    points, _ = alignment.merged(scans[0])
+    prepared = [prepare(cloud) for cloud in scans[0]]
+    np.testing.assert_allclose(alignment.merged(prepared)[0], points, atol=1e-9)
+    holed = [np.vstack([[np.nan] * 3, cloud]) for cloud in scans[0]]
+    np.testing.assert_allclose(alignment.merged(holed)[0], points)
+    flat = [cloud[:, :2] for cloud in scans[0]]
+    expected = flat[0] @ alignment.rotation[0][:, :2].T + alignment.translation[0]
+    np.testing.assert_allclose(alignment.merged(flat)[0][:500], expected)
+    with pytest.raises(ValueError, match="4 clouds for 5 scans"):
+        alignment.merged(scans[0][:4])
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"config": RegisterConfig(search_points=0)}, "config.search_points must be at least 16"),
+        ({"initial": [np.eye(4)] * 4 + [np.ones((4, 4))]}, r"the last row of initial\[4\] is"),
+    ],
+)
+def test_settings_and_starts_are_checked_before_anything_is_done(scans, options, told):
+    with pytest.raises(ValueError, match=told):
+        register_many(scans[0], **options)
+
+
+def test_poses_of_an_alignment_are_starts_and_nan_is_none(scans, alignment):
+    starts = many._checked_starts(alignment.transformation, 5)
+    assert [start is None for start in starts] == [False] * 4 + [True]
+    np.testing.assert_allclose(starts[1], alignment.transformation[1], atol=1e-12)
+
+
 def test_a_second_run_goes_on_where_the_first_ended(scans, alignment, tmp_path, monkeypatch):
     made = []
 

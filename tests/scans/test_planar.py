@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.geometry import trees
 from jaxreg.scans import correlation, planes
+from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
 from tests.scenes import angle_deg
 
@@ -99,6 +100,42 @@ def test_contour(seed):
     found = register(source, reference)
     assert_right(found, 170, [30, 4], source)
     assert found.success
+
+
+def test_weights_decide_which_part_of_a_plan_counts(seed):
+    """Where half of the lines moved by a little, the other half is right if the first hardly counts."""
+    rng = np.random.default_rng(seed)
+    source, reference = walls(rng), moved(walls(rng), 30, [1, 2])
+    moved_part = source[:, 0] > 4
+    changed = source + np.where(moved_part[:, None], [0.0, 0.04], 0.0)
+    told = register(changed, reference, weights=np.where(moved_part, 1e-3, 1.0))
+    plain = register(changed, reference)
+
+    def error(found):
+        middle = np.append(source[~moved_part].mean(axis=0), 0)
+        at = found.rotation @ middle + found.translation
+        return np.linalg.norm(at - turn(30) @ middle - [1, 2, 0])
+
+    assert error(told) < 0.5 * error(plain)
+    assert error(told) < 0.01
+
+
+def test_free_space_in_the_plane(seed):
+    """A place of two numbers is that of three; a pose that puts walls before what was seen says so."""
+    rng = np.random.default_rng(seed)
+    first, second = lidar(rng, np.array([1.5, 1.2])), lidar(rng, np.array([4.2, 2.0]))
+    plain = register(first, second)
+    found = register(first, second, viewpoint=(0.0, 0.0))
+    assert found.probability >= plain.probability
+    again = register(first, second, viewpoint=([0.0, 0.0, 0.0], [0.0, 0.0]))
+    np.testing.assert_array_equal(found.transformation, again.transformation)
+    assert found.probability == again.probability
+    wrong = np.eye(4)
+    wrong[:3, :3] = turn(100)
+    config = RegisterConfig(refine=None)
+    told = register(first, second, initial=wrong, viewpoint=(0.0, 0.0), config=config)
+    assert not told.success
+    assert "in front of what the other scanner measured" in told.reason
 
 
 def test_a_lidar_in_two_places(seed):

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from jaxreg.scans import prepare
+from jaxreg.scans.config import RegisterConfig
 
 
 @pytest.fixture
@@ -52,6 +54,34 @@ def test_reduction_uses_what_it_may(rng, most):
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     reduced = prepare.reduce_to(points, most)
     assert 0.7 * most <= len(reduced) <= most
+
+
+def of_a_cube(count, rng):
+    return rng.uniform(size=(count, 3))
+
+
+def of_a_sphere(count, rng):
+    """A Fibonacci lattice: neighbours are about equally far apart everywhere."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+
+
+def of_a_raster(count, rng):
+    rows = np.arange(count)
+    return np.stack([rows % 61, rows // 61, np.zeros(count)], axis=1) * [1, 1, 0.5]
+
+
+@pytest.mark.parametrize("shape", [of_a_cube, of_a_sphere, of_a_raster])
+def test_a_cloud_hardly_larger_than_the_limit_keeps_its_points(rng, shape):
+    for count in range(1025, 1450, 17):
+        points = shape(count, rng)
+        reduced = prepare.reduce_to(points, 1024)
+        assert 700 < len(reduced) <= 1024, count
+        # Every point is represented: none lies farther from a mean than two cubes of that many.
+        nearest = cKDTree(reduced).query(points)[0].max()
+        assert nearest < 4 * np.median(cKDTree(points).query(points, k=2)[0][:, 1]) + 1e-9
 
 
 def test_reduction_with_a_stray_point(rng):
@@ -127,3 +157,10 @@ def test_quantised_values_are_near_and_few():
     assert np.abs(np.log2(steps / values)).max() <= 1 / 8 + 1e-12
     assert len(np.unique(steps)) < 4.1 * np.log2(1e180)
     assert prepare.in_steps(0.0) == 0.0
+
+
+@pytest.mark.parametrize("field", ["search_points", "refine_points", "inlier_spacings"])
+def test_settings_out_of_range_are_refused(rng, field):
+    config = RegisterConfig(**{field: 0})
+    with pytest.raises(ValueError, match=f"config.{field} must be"):
+        prepare.prepare(rng.normal(size=(50, 3)), config=config)

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
-from jaxreg.scans.many import Alignment, Pair
+from jaxreg.scans.many import AlignedPair, Alignment
 from jaxreg.scans.relation import Relation
 from jaxreg.view.alignment_page import colour, draw_alignment, write_alignment_page
 from tests.view.test_page import content_of
@@ -17,7 +17,7 @@ def pair(source, reference, *, used=True, success=True, probability=0.98):
     relation = Relation(
         source, reference, "search", np.eye(4), probability, success, "", 0.5, 0.1, np.eye(6)
     )
-    return Pair(relation, probability, used, "" if used else "It contradicts others.")
+    return AlignedPair(relation, probability, used, "" if used else "It contradicts others.")
 
 
 @pytest.fixture
