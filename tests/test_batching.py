@@ -30,6 +30,20 @@ def test_pairs_in_a_loop_give_what_vmap_gives(seed):
     chex.assert_trees_all_close(one_at_a_time(smooth)(*one), smooth(*one), rtol=1e-12)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_arguments_by_name_are_of_the_batch_too(seed, backend, monkeypatch):
+    inputs, constants = batch_of_pairs(seed)
+    expected = jax.vmap(smooth)(inputs, constants)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    mapped = map_pairs(smooth)
+    for found in (
+        mapped(inputs, constants=constants),
+        mapped(constants=constants, inputs=inputs),
+        jax.jit(mapped)(inputs, constants=constants),
+    ):
+        chex.assert_trees_all_close(found, expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("shared", ["nothing", "reference", "constants"])
 def test_so_does_their_gradient_where_vmap_shares_arguments_too(seed, shared):
     inputs, constants = batch_of_pairs(seed)

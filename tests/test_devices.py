@@ -175,3 +175,59 @@ def test_half_an_address_is_named(monkeypatch):
     monkeypatch.setenv("JAX_NUM_PROCESSES", "2")
     with pytest.raises(ValueError, match="--process-id is missing: give all of"):
         devices.join_processes("127.0.0.1:1")
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """Sets variables of the environment, among those that say which process this is."""
+
+    def set_to(**variables):
+        for name in ("PROCID", "NTASKS"):
+            monkeypatch.delenv(f"SLURM_{name}", raising=False)
+        for name in ("PROCESS_ID", "NUM_PROCESSES", "COORDINATOR_ADDRESS"):
+            monkeypatch.delenv(f"JAX_{name}", raising=False)
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+
+    return set_to
+
+
+@pytest.mark.parametrize(
+    ("variables", "given", "place"),
+    [
+        ({}, (None, None), (0, 1)),
+        ({"SLURM_NTASKS": "4"}, (None, None), (0, 1)),
+        ({"SLURM_NTASKS": "4", "SLURM_PROCID": "2"}, (None, None), (2, 4)),
+        ({"SLURM_NTASKS": "4", "SLURM_PROCID": "2"}, (1, 3), (1, 3)),
+        ({"SLURM_NTASKS": "4"}, (1, None), (1, 4)),
+        ({"JAX_NUM_PROCESSES": "3", "JAX_PROCESS_ID": "1"}, (None, None), (1, 3)),
+    ],
+)
+def test_the_place_of_a_process_is_the_one_that_is_known(environment, variables, given, place):
+    environment(**variables)
+    assert devices.place_of(*given) == place
+
+
+@pytest.mark.parametrize(
+    ("variables", "given"),
+    [
+        ({"JAX_NUM_PROCESSES": "3"}, (None, None)),
+        ({"SLURM_NTASKS": "4"}, (None, 4)),
+        ({}, (1, None)),
+    ],
+)
+def test_half_a_place_is_named(environment, variables, given):
+    environment(**variables)
+    with pytest.raises(ValueError, match="--processes N and --process-id K is missing"):
+        devices.place_of(*given)
+
+
+def test_a_training_in_the_shell_of_an_allocation_is_alone(environment, monkeypatch):
+    joined = []
+    monkeypatch.setattr(devices, "_initialize", lambda *given: joined.append(given))
+    environment(SLURM_NTASKS="4")
+    devices.join_processes()
+    assert joined == []
+    environment(SLURM_NTASKS="4", SLURM_PROCID="2")
+    devices.join_processes()
+    assert joined == [()]

@@ -92,6 +92,7 @@ def test_the_network_gives_what_it_gave_before_it_was_saved(tmp_path, seed, symb
     [
         ({"symbolic": True}, "no program for any size.*--points"),
         ({"platforms": ("gpu",)}, "'gpu'.*choose from cpu, cuda"),
+        ({"platforms": ()}, "no platform is given: choose from cpu, cuda"),
         ({"points": (4, 100)}, "16 points or more"),
         ({"name": "no_such_weights"}, "no_such_weights"),
     ],
@@ -113,18 +114,69 @@ def test_clouds_that_do_not_fit_are_named(source, told):
         exported.load_exported(MADE_BEFORE)(source, jnp.zeros((100, 3)))
 
 
+def packed(path, card, program):
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("card.json", card if isinstance(card, bytes) else json.dumps(card))
+        file.writestr("program.bin", program)
+    return path
+
+
 def test_other_files_are_named(tmp_path):
-    (tmp_path / "text").write_text("no program")
-    with pytest.raises(ValueError, match="is no program of jaxreg"):
-        exported.load_exported(tmp_path / "text")
     with zipfile.ZipFile(MADE_BEFORE) as file:
         card, program = json.loads(file.read("card.json")), file.read("program.bin")
     for name, version, content, told in (
         ("newer", 99, program, "has version 99"),
         ("cut", 1, program[:100], "cannot be read by JAX"),
     ):
-        with zipfile.ZipFile(tmp_path / name, "w") as file:
-            file.writestr("card.json", json.dumps(card | {"version": version}))
-            file.writestr("program.bin", content)
+        packed(tmp_path / name, card | {"version": version}, content)
         with pytest.raises(ValueError, match=told):
             exported.load_exported(tmp_path / name)
+
+
+def without(card, name):
+    return {key: value for key, value in card.items() if key != name}
+
+
+NO_CARDS = {
+    "a list": lambda card: [1],
+    "bytes": lambda card: b"\xff",
+    "cut off": lambda card: json.dumps(card).encode()[:-5],
+    "no version": lambda card: without(card, "version"),
+    "a version in words": lambda card: card | {"version": "one"},
+    "no name": lambda card: without(card, "name"),
+    "no points": lambda card: without(card, "points"),
+    "three sizes": lambda card: card | {"points": [1, 2, 3]},
+    "sizes in words": lambda card: card | {"points": ["a", "b"]},
+    "no platforms": lambda card: without(card, "platforms"),
+    "platforms that are none": lambda card: card | {"platforms": 3},
+}
+
+
+@pytest.mark.parametrize("kind", NO_CARDS)
+def test_a_zip_of_something_else_is_named(tmp_path, kind):
+    with zipfile.ZipFile(MADE_BEFORE) as file:
+        card, program = json.loads(file.read("card.json")), file.read("program.bin")
+    path = packed(tmp_path / "p", NO_CARDS[kind](card), program)
+    with pytest.raises(ValueError, match=f"^{path} is no program of jaxreg: write one by jaxreg"):
+        exported.load_exported(path)
+
+
+def test_a_file_that_is_no_zip_or_a_damaged_one_is_named(tmp_path):
+    (tmp_path / "text").write_text("no program")
+    with zipfile.ZipFile(tmp_path / "other", "w") as file:
+        file.writestr("data.csv", "1,2")
+    whole = bytearray(MADE_BEFORE.read_bytes())
+    whole[200:230] = bytes(30)
+    (tmp_path / "damaged").write_bytes(whole)
+    for name in ("text", "other", "damaged"):
+        with pytest.raises(
+            ValueError, match=f"{name} is no program of jaxreg: write one by jaxreg"
+        ):
+            exported.load_exported(tmp_path / name)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"nothing: no such file; check the path\.$"):
+        exported.load_exported(tmp_path / "nothing")
+    with pytest.raises(ValueError, match=r"cannot be read \(Is a directory\): name a file"):
+        exported.load_exported(tmp_path)

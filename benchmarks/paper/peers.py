@@ -178,9 +178,9 @@ def trained(method: str, runs: dict[str, str], hours: str | None) -> dict[str, r
             raise ValueError(f"--runs {method}={runs[method]}: that is a run of {config.network}.")
         batch, categories = config.train.batch, config.data.train_categories
     else:
-        setting = load_card(method)["config"]
-        steps, batch = setting["train"]["steps"], setting["train"]["batch"]
-        categories = setting["data"]["train_categories"]
+        card = load_card(method)
+        steps, batch = card["step"], card["config"]["train"]["batch"]
+        categories = card["config"]["data"]["train_categories"]
     time = f", {float(hours):.3g} h" if hours else ""
     return {
         "label": f"{METHODS[method]}, trained here: {steps} steps of {batch} pairs{time}",

@@ -134,8 +134,8 @@ def _check(graph: PoseGraph, initial: RigidTransform, fixed: Any) -> None:
     for name, shape, rest in shapes:
         if len(edges) != 1 or shape != (*edges, *rest):
             raise ValueError(
-                f"graph.{name} has the axes {shape}, but graph.source {np.shape(graph.source)}: give "
-                "one row for every edge."
+                f"graph.{name} is {shape}, but graph.source {np.shape(graph.source)}: give one row for "
+                "every edge."
             )
     for name, flags, count in (("graph.mask", graph.mask, edges), ("fixed", fixed, poses)):
         if flags is not None and (np.shape(flags) != count or jnp.result_type(flags).kind != "b"):

@@ -86,11 +86,9 @@ def read_scan(path: str | Path) -> Scan:
             raise IsADirectoryError
         if suffix(path) not in _READERS:
             raise ValueError(unread.advice(path, READABLE))
-        if not path.is_file():
-            raise FileNotFoundError
-        path.open("rb").close()  # Readers would take a lack of permission for damage.
         if path.stat().st_size == 0:
             raise ValueError(f"{path} is empty (0 bytes): export it again.")
+        path.open("rb").close()  # Readers would take a lack of permission for damage.
     # A damaged file holds numbers that overflow, and NaN that signal.
     with packed.unpacked(path) as file, np.errstate(all="ignore"):
         scan = _READERS[suffix(path)](file)

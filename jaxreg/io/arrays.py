@@ -60,6 +60,8 @@ def read_numbers(path: Path, count: int, *, what: str = "point") -> np.ndarray:
         or not `count` of them.
     """
     with reading(path):
+        if not path.is_fifo():
+            path.open("rb").close()  # numpy would call a file that may not be read missing
         try:
             loaded = _loaded(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, ndmin=1)
         except OSError:

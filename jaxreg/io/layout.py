@@ -212,7 +212,7 @@ def _check_header(
             "to metres first, to UTM for instance."
         )
     if is_data(line) and len(names) < 3:
-        raise ValueError(f"{where}: '{' '.join(names)}' is not a point: give x y z in a line.")
+        raise ValueError(f"{where}: '{' '.join(names)[:60]}' is not a point: give x y z in a line.")
     if is_data(line) and len(names) > width and columns.coordinates(names):
         raise ValueError(
             f"{where}: the header has {len(names)} names for {width} columns: part them by what "

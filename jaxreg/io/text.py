@@ -137,8 +137,8 @@ def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray
     parts = re.split(r"(\s+)", body) if layout.separator is None else body.split(layout.separator)
     # Between the fields of blanks stand the blanks; before the first may stand some, too.
     places = [i for i, part in enumerate(parts) if layout.separator or part.strip()]
-    whole = np.isfinite(point[list(layout.columns)]).all()
-    new = dict(zip(layout.columns, point, strict=False)) if whole else {}
+    point = point[: len(layout.columns)]
+    new = dict(zip(layout.columns, point, strict=True)) if np.isfinite(point).all() else {}
     if layout.normals and new:
         fields = [parts[places[c]].strip().strip('"') for c in layout.normals]
         vector = [number(field, comma=layout.comma) for field in fields]

@@ -3,6 +3,7 @@
 from types import ModuleType
 from typing import Any
 
+import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxreg.config import Config
@@ -34,11 +35,16 @@ def for_registration(variables: Variables, config: Config) -> Variables:
 
 
 def for_training(variables: Variables, fresh: Variables, config: Config) -> Variables:
-    """`variables` with what they lack because only the training uses it, from `fresh` ones."""
+    """`variables` with what a file of them lacks, from `fresh` ones.
+
+    That is what only the training uses, and empty parts, such as the statistics of a network without
+    BatchNorm.
+    """
     part = _TRAINING_ONLY.get(config.network)
     lacks = part in fresh["params"] and part not in variables["params"]
     added = {part: fresh["params"][part]} if lacks else {}
-    return variables | {"params": variables["params"] | added}
+    empty = {name: tree for name, tree in fresh.items() if not jax.tree.leaves(tree)}
+    return empty | variables | {"params": variables["params"] | added}
 
 
 def pose(

@@ -11,6 +11,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Float
 
 from jaxreg.geometry.numerics import safe_norm
+from jaxreg.geometry.se3 import skew
 from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.types import RigidTransform
 
@@ -126,13 +127,6 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     cross = skew(vector)
     squared_cross = jnp.matmul(cross, cross, precision=Precision.HIGHEST)
     return jnp.eye(3, dtype=vector.dtype) + sine * cross + cosine * squared_cross
-
-
-def skew(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """``[v]_x``, the matrix of ``x -> v x x`` (cross product)."""
-    x, y, z = vector
-    zero = jnp.zeros_like(x)
-    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def _shortened(vector: Float[Array, "3"], largest: float) -> Float[Array, "3"]:

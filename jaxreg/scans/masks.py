@@ -12,7 +12,7 @@ def masks_of(mask: object, counts: tuple[int, int]) -> tuple[Bool[np.ndarray, "n
     """The masks of source and reference: one is of the source, a pair is of both (None: all points).
 
     Raises:
-      ValueError: a mask is not of booleans, one for each row of its cloud, or leaves fewer than three.
+      ValueError: a mask is not of booleans, one for each row of its cloud.
     """
     pair = mask if isinstance(mask, tuple | list) and len(mask) == 2 else (mask, None)
     return tuple(
@@ -30,16 +30,23 @@ def _mask(mask: object, count: int, name: str) -> Bool[np.ndarray, "n"]:
             f"the mask of the {name} is {array.dtype} {array.shape}: give {count} booleans, one for "
             "each of its points (True: the point takes part), or a pair of masks (source, reference)."
         )
-    if array.sum() < 3:
-        raise ValueError(f"the mask of the {name} leaves {array.sum()} points: a pose needs 3.")
     return array
+
+
+def check_enough(taking_part: Bool[np.ndarray, "n"], name: str) -> None:
+    """Raise ValueError unless three points take part, which are neither masked nor dropped."""
+    if taking_part.sum() < 3:
+        raise ValueError(
+            f"mask and weights leave {taking_part.sum()} points of the {name} that are finite and no "
+            "strays: a pose needs 3."
+        )
 
 
 def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
     """How much every point of the source counts.
 
     Raises:
-      ValueError: not a finite number of 0 or more for each row, or fewer than three are positive.
+      ValueError: not a finite number of 0 or more for each row.
     """
     try:
         array = np.asarray(weights, np.float64)
@@ -50,8 +57,6 @@ def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
             f"weights must be {count} numbers of 0 or more, one for each point of the source, got "
             f"shape {array.shape}."
         )
-    if np.sum(array > 0) < 3:
-        raise ValueError("weights are positive for fewer than 3 points: a pose needs 3.")
     return array
 
 

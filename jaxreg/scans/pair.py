@@ -94,6 +94,8 @@ def _taking_part(
     given = None if weights is None else masks.weights_of(weights, len(clouds[0].kept))
     if given is not None:
         chosen[0] = chosen[0] & (given > 0)
+    for cloud, rows, name in zip(clouds, chosen, ("source", "reference"), strict=True):
+        masks.check_enough(rows & cloud.kept, name)
     first, second = (
         prepare.part(cloud, rows, config) for cloud, rows in zip(clouds, chosen, strict=True)
     )

@@ -163,9 +163,9 @@ def prepare(
     sign, replace the computed ones; give zeros where unknown. `viewpoint` (3,), or (2,) in the plane,
     is where the scanner stood: a pose that puts points between it and what it measured is then held
     to be wrong. Give it only for a cloud that was seen from one place. `strays` are a few points ten
-    times as far from the middle as all others (`Prepared.notes` tells of them): they are left out, take part,
-    or are an error; centre and radius are those of the others in any case. `config` must be that of
-    the registration, and `name` is how messages refer to the cloud.
+    times as far from the middle as all others (`Prepared.notes` tells of them): they are left out,
+    take part, or are an error; centre and radius are those of the others in any case. `config` must
+    be that of the registration, and `name` is how messages refer to the cloud.
 
     Raises:
       ValueError: the cloud is not a numeric (n, 3) array with at least three finite points (the

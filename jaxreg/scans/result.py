@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxreg.geometry import trees
+from jaxreg.geometry import frame, trees
 from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans.prepare import Prepared
@@ -174,16 +174,17 @@ def in_unit(pose: RigidTransform, factor: float) -> RigidTransform:
 
 def out_of(clouds: tuple[Prepared, Prepared], pose: RigidTransform) -> RigidTransform:
     """A pose of the centred clouds as one of the clouds that were given."""
-    source, reference = clouds
-    turned = pose.rotation @ source.centre
-    return RigidTransform(pose.rotation, pose.translation + reference.centre - turned)
+    return frame.transform_out(_centres(clouds), pose)
 
 
 def centred(clouds: tuple[Prepared, Prepared], pose: RigidTransform) -> RigidTransform:
     """The inverse of `out_of`."""
-    source, reference = clouds
-    shift = pose.translation + pose.rotation @ source.centre - reference.centre
-    return RigidTransform(pose.rotation, shift)
+    return frame.transform_in(_centres(clouds), pose)
+
+
+def _centres(clouds: tuple[Prepared, Prepared]) -> frame.Frame:
+    """The frame of the centred clouds, in the unit of the input."""
+    return frame.Frame(clouds[0].centre, clouds[1].centre, 1.0)
 
 
 def resized(cloud: Prepared, size: float) -> Prepared:

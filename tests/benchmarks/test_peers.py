@@ -117,6 +117,5 @@ def test_the_record_fits_the_page_and_a_method_without_weights_has_no_figures(
 
 def test_weights_that_come_with_the_library_have_the_budget_of_their_card():
     row = peers.row_of("idam", peers.Options(hours=("idam=1.2",)))
-    card = load_card("idam")
-    assert row["steps"] == card["config"]["train"]["steps"]
+    assert row["steps"] == load_card("idam")["step"]
     assert row["label"] == f"IDAM, trained here: {row['steps']} steps of 16 pairs, 1.2 h"

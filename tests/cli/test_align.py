@@ -11,6 +11,8 @@ from jaxreg import io
 from jaxreg.cli import main, process
 from jaxreg.cli.options import BAD_INPUT, NOT_TRUSTED, SUCCESS
 from jaxreg.data.procedural import shapes
+from jaxreg.scans import many
+from jaxreg.scans.relation import Relation
 
 pytestmark = pytest.mark.float32
 
@@ -106,3 +108,81 @@ def test_mistakes_are_one_line(arguments, message, folder, run, monkeypatch):
     assert status == BAD_INPUT
     assert message in error
     assert "Traceback" not in error
+
+
+@pytest.fixture
+def placed(monkeypatch):
+    """Has `register_many` find these groups of the scans that it is given, and a planar pair."""
+
+    def found(groups):
+        def register_many(clouds, **_):
+            count = len(clouds)
+            covariance = np.diag([0, 0, 1e-6, 1e-4, 1e-4, 0.0])
+            relation = Relation(
+                1, 0, "search", np.eye(4), 0.99, True, "", 0.5, 0.1, covariance
+            )  # fmt: skip
+            alone = np.array([not any(k in group for group in groups) for k in range(count)])
+            return many.Alignment(
+                np.where(alone[:, None, None], np.nan, np.eye(3)),
+                np.where(alone[:, None], np.nan, np.zeros((count, 3))),
+                groups, np.where(alone, 0, 0.99), np.zeros((count, 6, 6)), np.zeros((count, 3)),
+                (many.AlignedPair(relation, 0.99, True, ""),) if groups else (),
+                tuple("Nothing fits." if left else "" for left in alone), (), (),
+            )  # fmt: skip
+
+        monkeypatch.setattr(many, "register_many", register_many)
+
+    return found
+
+
+@pytest.fixture
+def rooms(tmp_path):
+    """Four scans, named as the files of groups are."""
+    rng = np.random.default_rng(1)
+    paths = [tmp_path / f"room.{k}.ply" for k in range(1, 5)]
+    for k, path in enumerate(paths):
+        io.write_cloud(path, rng.normal(size=(10 + k, 3)))
+    return paths
+
+
+def test_the_files_of_further_groups_replace_no_input_and_no_output(rooms, tmp_path, run, placed):
+    placed(((0, 1), (2, 3)))
+    before = [path.read_bytes() for path in rooms]
+    outputs = "-o", tmp_path / "room.ply", "--html", tmp_path / "room.5.ply"
+    status, out, _ = run("align", *rooms, *outputs)
+    assert status == NOT_TRUSTED
+    assert [path.read_bytes() for path in rooms] == before
+    assert (tmp_path / "room.5.ply").read_text().startswith("<!")
+    assert f"wrote            {tmp_path / 'room.ply'} (group 1)\n" in out
+    assert f"wrote            {tmp_path / 'room.6.ply'} (group 2)\n" in out
+    for name, count in (("room.ply", 10 + 11), ("room.6.ply", 12 + 13)):
+        assert len(io.read_cloud(tmp_path / name)) == count
+    assert len(list(tmp_path.iterdir())) == 4 + 3
+
+
+def test_further_groups_have_numbers_where_nothing_is_in_the_way(rooms, tmp_path, run, placed):
+    placed(((0, 1), (2, 3)))
+    _, out, _ = run("align", *rooms, "-o", tmp_path / "all.ply")
+    assert f"{tmp_path / 'all.2.ply'} (group 2)" in out
+    assert len(io.read_cloud(tmp_path / "all.2.ply")) == 12 + 13
+
+
+def test_a_merged_cloud_that_is_not_written_is_told(rooms, tmp_path, run, placed):
+    placed(())
+    status, out, _ = run("align", *rooms, "-o", tmp_path / "all.ply")
+    assert status == NOT_TRUSTED
+    assert f"not written      {tmp_path / 'all.ply'}: no two scans hang together\n" in out
+    assert not (tmp_path / "all.ply").exists()
+
+
+@pytest.mark.parametrize("suffix", [".json", ".txt", ".tum", ".kitti", ".g2o"])
+def test_planar_scans_have_poses_and_all_else_that_is_asked_for(
+    rooms, tmp_path, run, placed, suffix
+):
+    """Three of the motions of a planar pair have no variance at all."""
+    placed(((0, 1, 2, 3),))
+    others = {"--json": "r.json", "--html": "r.html", "--plot": "r.png", "--poses": f"p{suffix}"}
+    files = [part for option, name in others.items() for part in (option, tmp_path / name)]
+    status, _, err = run("align", *rooms, *files)
+    assert (status, err.count("error")) == (SUCCESS, 0)
+    assert all((tmp_path / name).stat().st_size > 0 for name in others.values())

@@ -93,7 +93,12 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
     drawn, loads = [], []
     load = score.load_shapes
     monkeypatch.setattr(score, "load_shapes", lambda *a, **k: loads.append(a) or load(*a, **k))
-    monkeypatch.setattr(pictures, "plot_pair", lambda *a, truth: drawn.append((*a, truth)))
+
+    def draw(*arguments, truth):
+        drawn.append((*arguments, truth))
+        arguments[3].touch()
+
+    monkeypatch.setattr(pictures, "plot_pair", draw)
     turns = Rotation.from_euler("z", [[3], [4], [5]], degrees=True).as_matrix().astype(np.float32)
     np.savez("mine.npz", rotation=turns, translation=np.ones((3, 3), np.float32))
     options = ("--transforms", "mine.npz", *refine, "--picture", "first.png")
@@ -105,7 +110,8 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
         np.testing.assert_array_equal(transform.rotation, scored["rotation"][0])
         np.testing.assert_array_equal(transform.translation, scored["translation"][0])
     assert np.allclose(transform.rotation, turns[0]) == (not refine)
-    assert (str(path), source.shape, reference.shape) == ("first.png", (24, 3), (24, 3))
+    assert (path.suffix, source.shape, reference.shape) == (".png", (24, 3), (24, 3))
+    assert Path("first.png").is_file()
     truths = true_transforms(score.pair_stream(config, root=None).batches())
     np.testing.assert_array_equal(truth.rotation, truths.rotation[0])
     moved = source @ truth.rotation.T + truth.translation
@@ -133,11 +139,31 @@ def test_the_picture_shows_the_first_pair_as_it_was_scored(config, command, monk
             "--save-pairs x.npz --save-transforms x.npz",
             "x.npz is already read or written by this command",
         ),
+        (
+            "--method cemnet:x.npz --save-pairs x.npz",
+            "x.npz is already read or written by this command",
+        ),
+        ("--weights w/mine --json w/mine.json", "w/mine.json is already read or written"),
+        ("--method weights:w/mine --save-pairs w/mine.npz", "w/mine.npz is already read"),
+        ("--method icp --parts p --json p/evaluation.json", "p/evaluation.json is among the files"),
+        (
+            "--method icp --parts p --save-pairs p/batch_000001.npz",
+            "p/batch_000001.npz is among the files that this command reads: choose another folder",
+        ),
+        (
+            "--method icp --data.name folder --data.folder w --save-pairs w/new.npz",
+            "w/new.npz is among the files",
+        ),
+        ("--checkpoint run --json run/best/r.json", "run/best/r.json is among the files"),
     ],
 )
 def test_an_output_that_cannot_be_written_is_refused_before_the_work(
     command, asked, options, message
 ):
+    for folder in ("w", "p", "run/best"):
+        Path(folder).mkdir(parents=True)
+    for suffix in (".npz", ".json"):
+        Path("w/mine").with_suffix(suffix).touch()
     status, printed, error = command(*options.split())
     assert (status, printed, asked) == (2, "", [])
     assert error.startswith(f"error: {message}")
@@ -151,10 +177,31 @@ def test_the_figures_are_out_before_anything_that_may_fail(command, monkeypatch)
     monkeypatch.setattr(pictures, "plot_pair", full)
     options = "--method identity --json out.json --save-pairs p.npz --picture first.png"
     status, printed, error = command(*options.split())
-    assert (status, error) == (2, "error: first.png: No space left on device\n")
+    told = "could not be written (No space left on device): choose another place."
+    assert (status, error) == (2, f"error: first.png {told}\n")
     assert "MAE(R) deg" in printed
     assert json.loads(Path("out.json").read_text())["pairs"] == 3
     assert Path("p.npz").is_file()
+
+
+@pytest.mark.parametrize(
+    ("option", "place"),
+    [("--json", "r.json"), ("--save-transforms", "r.npz"), ("--picture", "r.png")],
+)
+def test_an_output_is_whole_or_as_it_was(command, monkeypatch, option, place):
+    def half(path):
+        path.open("w").write("half")
+        raise OSError(28, "No space left on device")
+
+    Path(place).write_text("an older one")
+    monkeypatch.setattr(Path, "write_text", lambda path, *_, **__: half(path))
+    monkeypatch.setattr(np, "savez", lambda file, **_: half(Path(file.name)))
+    monkeypatch.setattr(pictures, "plot_pair", lambda *a, **_: half(a[3]))
+    status, printed, error = command("--method", "identity", option, place)
+    assert (status, "MAE(R) deg" in printed) == (2, True)
+    assert error.startswith(f"error: {place} could not be written (No space left on device)")
+    assert Path(place).read_text() == "an older one"
+    assert {path.name for path in Path().iterdir()} == {"c.toml", place}
 
 
 def test_poses_that_are_none_are_written_all_the_same(command, monkeypatch):
@@ -321,3 +368,21 @@ def test_shares_that_do_not_fit_are_refused(command, options, message):
     status, _, error = command("--method", "identity", *options)
     assert status == 2
     assert message in error
+
+
+@pytest.mark.parametrize("options", [(), ("--parts", "p")])
+def test_in_the_shell_of_an_allocation_there_is_one_process(command, monkeypatch, options):
+    """SLURM says there how many tasks a job may start, and which task this is only to a task."""
+    monkeypatch.setenv("SLURM_NTASKS", "4")
+    status, output, error = command("--method", "identity", *options)
+    assert (status, error) == (0, "")
+    assert "MAE(R) deg" in output
+
+
+def test_without_parts_the_environment_does_not_share_an_evaluation(command, monkeypatch):
+    monkeypatch.setenv("SLURM_NTASKS", "4")
+    monkeypatch.setenv("SLURM_PROCID", "3")
+    status, output, _ = command("--method", "identity")
+    assert (status, "MAE(R) deg" in output) == (0, True)
+    status, output, _ = command("--method", "identity", "--batch", "1", "--parts", "p")
+    assert (status, "this process is done" in output) == (0, True)

@@ -1,5 +1,7 @@
 """`jaxreg register` of few points, two-column files, level scans, and parts that moved."""
 
+import dataclasses
+import importlib
 import json
 
 import numpy as np
@@ -8,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg import io
 from jaxreg.cli.options import BAD_INPUT, NOT_TRUSTED, SUCCESS
+from tests.view.test_page import registration
 
 pytestmark = pytest.mark.float32
 
@@ -151,6 +154,42 @@ def test_a_file_of_two_columns_beside_one_of_three_is_refused(tmp_path, run, suf
     points[:, 2] = 7
     np.savetxt(tmp_path / "b.txt", points)
     assert run("register", plan, tmp_path / "b.txt")[0] == SUCCESS
+
+
+def test_a_row_that_is_no_point_does_not_hide_the_height(tmp_path, run):
+    points = np.random.default_rng(3).uniform(0, 50, (80, 3))
+    np.savetxt(tmp_path / "plan.txt", points[:, :2])
+    np.save(tmp_path / "b.npy", np.insert(points, 5, np.nan, axis=0))
+    files = tmp_path / "plan.txt", tmp_path / "b.npy"
+    status, _, err = run("register", *files, "--nonfinite", "drop")
+    assert status == BAD_INPUT
+    assert "has two columns, x and y, and" in err
+
+
+def test_no_output_replaces_the_file_of_what_is_stable(targets, tmp_path, run):
+    stable = tmp_path / "s.json"
+    stable.write_text("1\n1\n0\n1\n1\n")
+    for option in ("--json", "--html"):
+        status, out, err = run("register", *targets, "--stable", stable, option, stable)
+        assert (status, out) == (BAD_INPUT, "")
+        assert f"{stable} is already read or written by this command" in err
+    assert stable.read_text() == "1\n1\n0\n1\n1\n"
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.28])
+def test_sizes_are_compared_at_the_scale_that_was_found(tmp_path, run, monkeypatch, scale):
+    """With --scale the size is no mistake; without it, a source in feet is one in other units."""
+    points = np.random.default_rng(3).normal(size=(200, 3))
+    files = tmp_path / "a.npy", tmp_path / "b.npy"
+    np.save(files[0], points / 3.28)
+    np.save(files[1], points)
+    found = dataclasses.replace(registration(points, points, rotation=np.eye(3)), scale=scale)
+    monkeypatch.setattr(
+        importlib.import_module("jaxreg.scans.pair"), "register", lambda *_, **__: found
+    )
+    status, out, _ = run("register", *files)
+    assert status == SUCCESS
+    assert ("are their units metres and feet?" in out) == (scale == 1)
 
 
 def test_few_points_have_no_scale(targets, run):

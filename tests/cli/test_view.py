@@ -1,5 +1,7 @@
 """`jaxreg view`."""
 
+import os
+
 import pytest
 
 from jaxreg.cli import view
@@ -30,3 +32,14 @@ def test_view_writes_a_page_and_opens_it_when_asked(folder, tmp_path, run, monke
     assert opened == [page.as_uri()]
     status, _, err = run("view", folder / "a.ply", "-o", tmp_path / "no" / "page.html")
     assert (status, "does not exist" in err) == (BAD_INPUT, True)
+
+
+def test_a_name_that_is_not_utf8_is_shown_as_far_as_it_is(tmp_path, run):
+    name = os.fsdecode(b"sc\xe4n.xyz")
+    try:
+        (tmp_path / name).write_text("1 2 3\n4 5 6\n")
+    except OSError:
+        pytest.skip("this file system has UTF-8 names only")
+    status, _, err = run("view", tmp_path / name, "-o", tmp_path / "v.html")
+    assert (status, err) == (SUCCESS, "")
+    assert "sc?n.xyz</title>" in (tmp_path / "v.html").read_text("utf-8")

@@ -1,5 +1,7 @@
 """Your own files: which belong to a split, what becomes of them, and clear errors."""
 
+import gzip
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,27 @@ def test_the_last_files_by_number_are_for_the_test(scans):
     test = folder.split_files(scans, "test", test_share=0.25)
     assert [path.stem for path in test] == ["scan_9", "scan_10", "scan_11"]
     assert [path.stem for path in train] == [f"scan_{i}" for i in range(9)]
+
+
+def test_packed_clouds_are_files_and_folders_are_none(tmp_path):
+    for i in range(3):
+        io.write_cloud(tmp_path / f"{i}.xyz", np.random.default_rng(i).normal(size=(9, 3)))
+    (tmp_path / "3.XYZ.GZ").write_bytes(gzip.compress((tmp_path / "2.xyz").read_bytes()))
+    (tmp_path / "notes.md.gz").write_bytes(gzip.compress(b"not a cloud"))
+    (tmp_path / "4.ply").mkdir()
+    io.write_cloud(tmp_path / "4.ply" / "inside.npy", np.random.default_rng(4).normal(size=(9, 3)))
+    train, test = (folder.split_files(tmp_path, s, test_share=0.5) for s in ("train", "test"))
+    names = [str(path.relative_to(tmp_path)) for path in (*train, *test)]
+    assert names == ["0.xyz", "1.xyz", "2.xyz", "3.XYZ.GZ", "4.ply/inside.npy"]
+    clouds, _ = folder.load(tmp_path, "test", points=9, test_share=0.5)
+    assert clouds.shape == (2, 9, 3)
+
+
+def test_raised_digits_in_names_are_no_numbers(tmp_path):
+    for name in ("m2²_9.xyz", "m2²_10.xyz"):
+        io.write_cloud(tmp_path / name, np.eye(3))
+    (held,) = folder.split_files(tmp_path, "test", test_share=0.5)
+    assert held.name == "m2²_10.xyz"
 
 
 def test_folders_train_and_test_are_the_split(scans):

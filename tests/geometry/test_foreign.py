@@ -89,6 +89,27 @@ def test_masked_rows_count_as_not_finite_and_raise_nothing():
         given(masked)
 
 
+def test_masked_coordinates_of_structured_arrays_are_no_points():
+    """Whatever stands below the mask; what is masked besides x, y, z does not count."""
+    kinds = [("intensity", "i4"), ("x", "f4"), ("y", "f8"), ("z", "f8")]
+    rows = np.ma.masked_array(
+        np.zeros(300, kinds), mask=np.zeros(300, [(n, "?") for n, _ in kinds])
+    )
+    for axis, column in zip("xyz", POINTS.astype(np.float32).T, strict=True):
+        rows[axis] = column
+    for axis, row, fill in (("x", 0, -9999), ("z", 7, np.nan), ("intensity", 9, -9999)):
+        rows[axis][row] = fill
+        rows.mask[axis][row] = True
+    for cloud in (
+        rows,
+        types.SimpleNamespace(points=np.ma.stack([rows[a] for a in "xyz"], axis=1)),
+    ):
+        points, finite = given(cloud)
+        np.testing.assert_array_equal(np.flatnonzero(~finite), [0, 7])
+        np.testing.assert_array_equal(points[finite], POINTS.astype(np.float32)[finite])
+    assert given(rows.data, nonfinite="drop")[1].sum() == 299, "without a mask a fill is a value"
+
+
 @pytest.mark.parametrize(
     ("cloud", "advice"),
     [

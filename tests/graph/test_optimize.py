@@ -99,3 +99,70 @@ def test_reverse_derivatives_are_those_forward(problem):
     forward, backward = (jax.jit(derivative(far))(0.1) for derivative in (jax.jacfwd, jax.grad))
     np.testing.assert_allclose(backward, forward, rtol=1e-9)
     assert abs(backward) > 1e-3
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_masked_edge_has_no_weight(problem, robust):
+    """As on the host; whatever stands in its place."""
+    graph, start, _ = problem
+    mask = np.arange(2 * NODES) != 3
+    graph.transform.translation[3] = np.nan
+    masked = graph._replace(mask=mask)
+    found = optimize_poses(masked, start, robust=robust, iterations=2, cg_iterations=4)
+    np.testing.assert_array_equal(found.weights == 0, ~mask)
+    np.testing.assert_array_equal(
+        found.weights == 0, solve_poses(masked, start, robust=robust).weights == 0
+    )
+    assert np.isfinite(found.poses.translation).all()
+
+
+def outside(index, number):
+    wrong = index.copy()
+    wrong[2] = number
+    return wrong
+
+
+@pytest.mark.parametrize("function", [optimize_poses, solve_poses])
+@pytest.mark.parametrize("name", ["source", "reference"])
+@pytest.mark.parametrize("number", [-1, NODES])
+def test_an_index_without_a_pose_is_named(problem, function, name, number):
+    """JAX would take the last pose instead."""
+    graph, start, _ = problem
+    wrong = graph._replace(**{name: outside(getattr(graph, name), number)})
+    with pytest.raises(
+        ValueError, match=f"graph.{name} has the index {number}, .* 6 poses: number"
+    ):
+        function(wrong, start)
+
+
+@pytest.mark.untyped
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda g: g._replace(source=g.source.astype(float)), "graph.source has dtype float64"),
+        (lambda g: g._replace(reference=g.reference[:-1]), r"graph.reference is \(11,\), but"),
+        (lambda g: g._replace(information=g.information[0]), r"graph.information is \(6, 6\)"),
+        (lambda g: g._replace(mask=g.mask[1:]), r"graph.mask is \(11,\)"),
+        (lambda g: g._replace(mask=g.mask.astype(int)), "graph.mask must be bool"),
+        (
+            lambda g: g._replace(transform=jax.tree.map(lambda x: x[:3], g.transform)),
+            r"graph.transform is \(3,\)",
+        ),
+    ],
+)
+def test_edges_that_do_not_fit_together_are_named_at_trace_time(problem, change, told):
+    graph, start, _ = problem
+    with pytest.raises(ValueError, match=told):
+        jax.eval_shape(optimize_poses, change(graph), start)
+
+
+@pytest.mark.untyped
+def test_poses_that_do_not_fit_are_named_at_trace_time(problem):
+    graph, start, _ = problem
+    one = jax.tree.map(lambda x: x[0], start)
+    with pytest.raises(ValueError, match=r"initial must be poses with one leading axis, got \(\)"):
+        jax.eval_shape(optimize_poses, graph, one)
+    with pytest.raises(ValueError, match=r"fixed must be bool of shape \(6,\)"):
+        jax.eval_shape(lambda x, y: optimize_poses(x, y, fixed=jnp.zeros(5, bool)), graph, start)
+    # An index that is only known in the program is no error.
+    assert jax.eval_shape(optimize_poses, graph, start).weights.shape == (2 * NODES,)

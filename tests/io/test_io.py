@@ -205,8 +205,12 @@ def test_numpy_archives_and_structured_arrays(tmp_path, points):
     rows = np.zeros(40, [("z", "f8"), ("y", "f8"), ("x", "f8")])
     rows["x"], rows["y"], rows["z"] = points.T
     np.save(tmp_path / "c.npy", rows)
-    for name in ("a.npz", "b.npz", "c.npy"):
+    np.save(tmp_path / "d.npy", rows.reshape(20, 2))  # organised, two columns wide
+    for name in ("a.npz", "b.npz", "c.npy", "d.npy"):
         np.testing.assert_array_equal(io.read_cloud(tmp_path / name), points)
+        assert io.read_scan(tmp_path / name).notes == ()
+    np.save(tmp_path / "e.npy", points[:, :2])
+    assert io.read_scan(tmp_path / "e.npy").notes == ("two columns: z is 0",)
 
 
 CUBE_OFF = (

@@ -1,5 +1,7 @@
 """T26: every malformed file is a ValueError that names the file, the place and what to do."""
 
+import contextlib
+import os
 import pickle
 import struct
 
@@ -54,6 +56,10 @@ CASES = {
         "line 1: the header has 6 names for 5 columns",
     ),
     "index.csv": (b",0,1,2\n0,1,2,3\n1,4,5,6\n", ", 0, 1, 2, not x, y, z"),
+    "raised.xyz": ("²\n1 2 3\n4 5 6\n".encode(), "line 1: '²' is not a point"),
+    "raised.pts": ("2\n1 2 3 0\n4 5 6 0\n²\n7 8 9 0\n".encode(), "line 4: '²' has 1 column"),
+    "raised.ply": (ply().replace(b"vertex 3", b"vertex \xb2") + b"1 2 3\n", "line 3"),
+    "digits.xyz": (b"9" * 5000 + b"\n1 2 3\n4 5 6\n", "line 1: '9{60}' is not a point"),
     "binary.txt": (b"\xff\xfe\x00\x81" * 10, "not a text file"),
     "short.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n", "truncated"),
     "word.pcd": (PCD.format(kind="ascii").encode() + b"1 2 3\n4 x 6\n7 8 9\n", "point 1"),
@@ -111,16 +117,70 @@ def test_damaged_files_are_read_or_refused_by_name(tmp_path, seed, suffix):
             assert (cloud.ndim, cloud.shape[1], cloud.dtype) == (2, 3, np.float64)
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(ValueError, match="no such file"):
-        io.read_cloud(tmp_path / "absent.ply")
+READERS = (
+    io.read_cloud,
+    io.read_matrix,
+    io.read_poses,
+    io.read_pairs_log,
+    lambda path: io.read_numbers(path, 2),
+)
+UNKNOWN = {(io.read_cloud, ".json"), (io.read_cloud, ".g2o")}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".json", ".npy", ".g2o", ".txt"])
+def test_missing_file(tmp_path, suffix):
+    (tmp_path / "file").touch()
+    for path in (tmp_path / f"absent{suffix}", tmp_path / "file" / f"absent{suffix}"):
+        for read in READERS:
+            told = "unknown format" if (read, suffix) in UNKNOWN else "no such file; check the path"
+            with pytest.raises(ValueError, match=told) as caught:
+                read(path)
+            assert str(caught.value).startswith(str(path))
+
+
+@contextlib.contextmanager
+def as_another_user():
+    """Root may read every file: what it does inside, another user does, who may not."""
+    if not hasattr(os, "geteuid"):
+        pytest.skip("permissions are those of POSIX")
+    own = os.geteuid()
+    try:
+        if own == 0:
+            os.seteuid(65534)
+        yield
+    finally:
+        os.seteuid(own)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".json", ".npy", ".g2o", ".txt", ".pcd", ".xyz.gz"])
+@pytest.mark.parametrize("place", ["file", "folder"])
+def test_a_file_that_may_not_be_read(tmp_path, suffix, place):
+    path = tmp_path / "closed" / f"a{suffix}"
+    path.parent.mkdir()
+    path.write_text("1 2 3\n4 5 6\n")
+    closed = path if place == "file" else path.parent
+    mode = closed.stat().st_mode
+    closed.chmod(0)
+    try:
+        for read in READERS:
+            if (read, suffix) in UNKNOWN:
+                continue
+            with contextlib.suppress(ValueError):
+                read(path)  # for the imports that another user may not do
+            with as_another_user(), pytest.raises(ValueError, match="Permission denied") as caught:
+                read(path)
+            told = f"{path} cannot be read (Permission denied): check who may read it, or copy it."
+            assert str(caught.value) == told
+    finally:
+        closed.chmod(mode)
 
 
 def test_directory(tmp_path):
     (tmp_path / "scans.ply").mkdir()
     for path in (tmp_path, tmp_path / "scans.ply"):
-        with pytest.raises(ValueError, match="is a directory"):
-            io.read_cloud(path)
+        for read in READERS:
+            with pytest.raises(ValueError, match="is a directory, not a file: name a file in it"):
+                read(path)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -29,6 +29,17 @@ def test_matrices_are_read_from_any_form(tmp_path, name):
     np.testing.assert_array_equal(read_matrix(path), TRUTH)
 
 
+def test_what_is_no_file_is_said(tmp_path):
+    for name in ("T.txt", "T.npy", "T.json"):
+        with pytest.raises(ValueError, match=f"{name}: no such file; check the path"):
+            read_matrix(tmp_path / name)
+        (tmp_path / name).mkdir()
+        with pytest.raises(
+            ValueError, match=f"{name} is a directory, not a file: name a file in it"
+        ):
+            read_matrix(tmp_path / name)
+
+
 def test_a_pickled_matrix_is_refused(tmp_path):
     np.save(tmp_path / "T.npy", np.array([{}], object), allow_pickle=True)
     with pytest.raises(ValueError, match="does not contain a 4x4 matrix"):

@@ -131,6 +131,7 @@ TEXTS = {
     "a.asc": ("//X Y Z Nx Ny Nz\n1 2 3 2 0 0\n", "//X Y Z Nx Ny Nz\n8 21 33 0 2 0\n"),
     "a.tsv": ("x\ty\tz\tname\n1\t2\t3\tan oak\n", "x\ty\tz\tname\n8\t21\t33\tan oak\n"),
     "b.xyz": ("1 2 3\nnan 5 6\n", "8 21 33\nnan 5 6\n"),
+    "b.csv": ("1,2,3 # a corner\n4,5,6\n", "8,21,33 # a corner\n5,24,36\n"),
 }  # fmt: skip
 
 
@@ -148,6 +149,47 @@ def test_text_to_csv_is_parted_by_commas(tmp_path):
     (tmp_path / "a.xyz").write_text("X Y Z R\n1 2 3 255\n4 5 6 0\n")
     moved(tmp_path / "b.csv", tmp_path / "a.xyz")
     assert (tmp_path / "b.csv").read_text() == "X,Y,Z,R\n8,21,33,255\n5,24,36,0\n"
+
+
+PLANAR = {
+    "a.txt": ("1 2\n4 5\n7 8\n", "8 21\n5 24\n2 27\n"),
+    "a.xyz": ("# a plan\nx  y\n 1  2 # a corner\n\n4\t5\nnan 8\n7 8\n",
+              "# a plan\nx  y\n 8  21 # a corner\n\n5\t24\nnan 8\n2 27\n"),
+    "a.csv": ("x,y\n1,2\n4,5\n7,8.5\n", "x,y\n8,21\n5,24\n1.5,27\n"),
+    "a.asc": ("1, 2 // a corner\n4, 5\n7, 8\n", "8,21 // a corner\n5,24\n2,27\n"),
+    "a.dat": ("1,5;2\n4;5\n7;8\n", "8;21,5\n5;24\n2;27\n"),
+    "a.tsv": ("1.5;2\n4;5\n7;8\n", "8;21.5\n5;24\n2;27\n"),
+    "b.txt": ("1|2\n4|5\n7|8\n", "8|21\n5|24\n2|27\n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANAR)
+def test_text_of_two_columns_keeps_them(tmp_path, name):
+    before, after = PLANAR[name]
+    (tmp_path / name).write_text(before, "utf-8")
+    out = tmp_path / f"out{(tmp_path / name).suffix}"
+    io.check_output(out, tmp_path / name)
+    points = io.read_cloud(tmp_path / name)
+    shift = np.array([10.0, 20, 0])
+    assert io.write_moved(out, tmp_path / name, TURN, shift, points=points) == ()
+    assert out.read_text("utf-8") == after
+    whole = np.isfinite(points).all(axis=1)
+    np.testing.assert_allclose(io.read_cloud(out)[whole], points[whole] @ TURN.T + shift)
+
+
+def test_two_columns_to_csv_are_parted_by_a_comma(tmp_path):
+    (tmp_path / "a.xyz").write_text("x y\n1 2\n4 5\n7 8\n")
+    moved(tmp_path / "b.csv", tmp_path / "a.xyz")
+    assert (tmp_path / "b.csv").read_text() == "x,y\n8,21\n5,24\n2,27\n"
+
+
+def test_a_height_that_two_columns_cannot_hold_is_told(tmp_path):
+    (tmp_path / "a.xyz").write_text("1 2\n4 5\n7 8\n")
+    assert moved(tmp_path / "b.xyz", tmp_path / "a.xyz") == (
+        "two columns hold x and y alone: z, up to 30, is left out",
+    )
+    assert moved(tmp_path / "c.ply", tmp_path / "a.xyz") == ()
+    np.testing.assert_array_equal(io.read_cloud(tmp_path / "c.ply")[:, 2], [30, 30, 30])
 
 
 @pytest.mark.parametrize("shift", [[0.5, 0, 0], [3e6, 0, 0], [0, 1e12, 0]])

@@ -1,5 +1,7 @@
 """Poses of many scans: every format there and back, and what others write."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,6 +30,138 @@ def test_every_format_gives_the_poses_back(poses, suffix, tmp_path):
     assert list(found) == [NAMES[0], NAMES[2]]
     for k in (0, 2):
         np.testing.assert_allclose(found[NAMES[k]], poses[k], rtol=1e-14, atol=1e-14)
+
+
+def shifts(*lengths):
+    """Poses along x, one a length; NaN is no pose."""
+    poses = np.repeat(np.eye(4)[None], len(lengths), 0)
+    poses[:, 0, 3] = lengths
+    poses[np.isnan(lengths)] = np.nan
+    return poses
+
+
+def lengths_of(found):
+    return {name: pose[0, 3] for name, pose in found.items()}
+
+
+def test_poses_without_names_are_those_of_the_scans_in_their_order(tmp_path):
+    """Also where a scan is called as another one is numbered."""
+    names = ["1.ply", "2.ply", "3.ply"]
+    poses = shifts(10, 20, 30)
+    blocks = "\n".join(" ".join(map(str, row)) for row in poses.reshape(-1, 4))
+    (tmp_path / "bare.txt").write_text(blocks)
+    (tmp_path / "titled.txt").write_text("# from the odometry\n" + blocks)
+    (tmp_path / "list.json").write_text(json.dumps(poses.tolist()))
+    for suffix in (".tum", ".kitti", ".g2o"):
+        write_poses(tmp_path / f"p{suffix}", poses, names=names)
+    for path in tmp_path.iterdir():
+        found = lengths_of(read_poses(path, names))
+        assert found == {"1.ply": 10, "2.ply": 20, "3.ply": 30}, path.name
+
+
+def test_a_block_without_a_pose_shifts_no_other(tmp_path):
+    rows = shifts(np.nan, 20, 30).reshape(-1, 4)
+    np.savetxt(tmp_path / "p.txt", rows)
+    assert lengths_of(read_poses(tmp_path / "p.txt", ["s0", "s1", "s2"])) == {"s1": 20, "s2": 30}
+    assert lengths_of(read_poses(tmp_path / "p.txt")) == {"1": 20, "2": 30}
+
+
+def test_a_row_of_tum_without_a_pose_shifts_no_other(tmp_path):
+    row = "{} {} 0 0 0 0 0 1\n"
+    times = (1305031102.17, 1305031102.21, 1305031102.25), (7, 7, 8), (0, 1, 2)
+    for seconds in times:
+        rows = zip(seconds, ("nan", 20, 30), strict=True)
+        (tmp_path / "p.tum").write_text("".join(row.format(*one) for one in rows))
+        assert lengths_of(read_poses(tmp_path / "p.tum", ["a", "b", "c"])) == {"b": 20, "c": 30}
+
+
+@pytest.mark.parametrize(
+    "printed",
+    [
+        lambda poses: "\n".join(str(row) for row in poses.reshape(-1, 4).tolist()),
+        lambda poses: "\n\n".join(np.array2string(pose) for pose in poses),
+        lambda poses: "\n".join(f"{pose.tolist()};".replace("], [", "],\n[") for pose in poses),
+    ],
+)
+def test_matrices_are_read_as_python_prints_them(tmp_path, printed):
+    (tmp_path / "p.txt").write_text(f"# two of them\n{printed(shifts(5, 6))}  # the last\n")
+    assert lengths_of(read_poses(tmp_path / "p.txt", ["a", "b"])) == {"a": 5, "b": 6}
+
+
+@pytest.mark.parametrize("suffix", [".json", ".txt"])
+@pytest.mark.parametrize(
+    ("keys", "names", "expected"),
+    [
+        # Of equal file names the folders decide, as many of them as are needed.
+        (["a/c.ply", "b/c.ply"], ["/x/a/c.ply", "/x/b/c.ply"], [10, 20]),
+        (["/old/1/l/c.ply", "/old/2/l/c.ply"], ["/n/2/l/c.ply", "/n/1/l/c.ply"], [20, 10]),
+        (["a/c.ply", "b/c.ply"], ["b/c.pcd", "a/c.xyz.gz"], [20, 10]),
+        (["a/c", "b/c"], ["b/c.ply", "a/c.ply"], [20, 10]),
+        # The whole path, also where it is the end of another.
+        (["x/c.ply", "c.ply"], ["c.ply", "x/c.ply"], [20, 10]),
+        # Of equal stems the file names decide, but not against the folders.
+        (["o/c.ply", "o/c.pcd"], ["n/c.pcd", "n/c.ply"], [20, 10]),
+        (["a/c.pcd", "b/c.ply"], ["a/c.ply", "b/c.pcd"], [10, 20]),
+        # A name that is found once is enough, whatever the folder.
+        (["old/c.ply", "old/d.ply"], ["new/d.ply", "new/c.ply"], [20, 10]),
+        # What is another scan's is no scan's besides.
+        (["b/c.ply", "d.ply"], ["/x/a/c.ply", "/x/b/c.ply"], [None, 10]),
+        (["c.ply", "d.ply"], ["c.pcd", "c.ply"], [None, 10]),
+        # The last digits of a time are no suffix.
+        (["1305.17", "1305.21"], ["1305.21", "1305.99"], [20, None]),
+        (["1305.17", "1305.21"], ["1305.21.ply", "1305.17.ply"], [20, 10]),
+        # Numbers are names where all are found, and count the scans where none is.
+        (["1", "2"], ["1.ply", "2.ply"], [10, 20]),
+        (["0", "1"], ["a.ply", "b.ply"], [10, 20]),
+    ],
+)
+def test_scans_are_found_by_what_tells_their_paths_apart(tmp_path, suffix, keys, names, expected):
+    write_poses(tmp_path / f"p{suffix}", shifts(10, 20), names=keys)
+    found = lengths_of(read_poses(tmp_path / f"p{suffix}", names))
+    assert [found.get(name) for name in names] == expected
+
+
+@pytest.mark.parametrize("suffix", [".json", ".txt"])
+def test_a_scan_without_a_pose_gets_none_of_the_same_name(tmp_path, suffix):
+    write_poses(
+        tmp_path / f"p{suffix}", shifts(np.nan, 20, 30), names=["a/c.ply", "b/c.ply", "d.ply"]
+    )
+    found = read_poses(tmp_path / f"p{suffix}", ["/x/a/c.ply", "/x/d.ply"])
+    assert lengths_of(found) == {"/x/d.ply": 30}
+
+
+@pytest.mark.parametrize("suffix", [".json", ".txt"])
+@pytest.mark.parametrize(
+    ("keys", "names", "told"),
+    [
+        (
+            ["c.ply", "d.ply"],
+            ["a/c.ply", "b/c.ply"],
+            "whether a/c.ply has the pose of c.ply is open",
+        ),
+        (["a/c.ply", "b/c.ply"], ["d/c.ply"], "of a/c.ply or b/c.ply is open, since several files"),
+        (["a/c.ply", "b/c.ply"], ["a/c.ply", "d/c.ply"], "whether d/c.ply has the pose of b/c.ply"),
+        (["c.ply", "c.pcd"], ["c.stl"], "of c.ply or c.pcd is open"),
+        (["0", "1", "2"], ["1.ply", "2.ply", "3.ply"], "may be names of the scans or count them"),
+    ],
+)
+def test_a_pose_that_could_be_of_several_scans_is_refused(tmp_path, suffix, keys, names, told):
+    poses = shifts(10, 20, 30)[: len(keys)]
+    write_poses(tmp_path / f"p{suffix}", poses, names=keys)
+    with pytest.raises(ValueError, match=told) as caught:
+        read_poses(tmp_path / f"p{suffix}", names)
+    assert str(tmp_path / f"p{suffix}") in str(caught.value)
+
+
+def test_blocks_are_all_named_or_none_is_and_by_names_of_their_own(tmp_path):
+    block = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    for text, told in (
+        (f"# a\n{block}# b\n{block}{block}", "block 3 has no name above it, and others have"),
+        (f"# a\n{block}# b\n{block}# a\n{block}", "two blocks have the name a"),
+    ):
+        (tmp_path / "p.txt").write_text(text)
+        with pytest.raises(ValueError, match=told):
+            read_poses(tmp_path / "p.txt")
 
 
 def test_kitti_s_own_file_is_read_by_lines(tmp_path):

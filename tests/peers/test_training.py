@@ -2,6 +2,7 @@
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -53,7 +54,7 @@ def test_weights_are_released_without_what_only_the_training_uses(tmp_path):
     place = release("own", tmp_path / "run", "command", directory=tmp_path).with_suffix("")
     released, _ = load_pretrained(str(place))
     assert set(trained["params"]) - set(released["params"]) == {"decoder"}
-    points = np.random.default_rng(0).uniform(-1, 1, (2, 24, 3)).astype(np.float32)
+    points = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (2, 24, 3)), jnp.float32)
     for both in zip(
         *(jax.tree.leaves(fmr.register(x, *points, config=config)) for x in (trained, released)),
         strict=True,

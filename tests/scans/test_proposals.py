@@ -40,6 +40,18 @@ def test_successive_scans_are_those_in_time_and_none_across_a_pause():
     assert proposals.successive(np.zeros(3)) == {(0, 1), (1, 2), (0, 2)}
 
 
+def test_scans_at_the_same_time_are_no_measure_of_a_pause():
+    """Of three scanners that take a scan each at every tick."""
+
+    def next_two(first, last):
+        return {(i, j) for i in range(first, last) for j in (i + 1, i + 2) if j < last}
+
+    ticks = np.repeat(np.arange(3.0), 3)
+    assert proposals.successive(ticks) == next_two(0, 9)
+    paused = np.concatenate([ticks, ticks + 100])
+    assert proposals.successive(paused) == next_two(0, 9) | next_two(9, 18)
+
+
 def test_the_most_alike_are_those_of_a_full_sort(seed):
     rng = np.random.default_rng(seed)
     score = rng.normal(size=(7, 7))

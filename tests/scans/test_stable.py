@@ -126,10 +126,10 @@ def test_a_mask_and_a_weight_of_zero_say_what_moved():
     [
         ({"mask": np.ones(5)}, "the mask of the source is float64"),
         ({"mask": (None, np.ones(5, bool))}, "the mask of the reference is bool"),
-        ({"mask": np.zeros(80, bool)}, "leaves 0 points"),
+        ({"mask": np.zeros(80, bool)}, "leave 0 points of the source"),
         ({"weights": np.ones(5)}, "80 numbers of 0 or more"),
         ({"weights": -np.ones(80)}, "80 numbers of 0 or more"),
-        ({"weights": np.zeros(80)}, "fewer than 3 points"),
+        ({"weights": np.zeros(80)}, "leave 0 points of the source"),
     ],
 )
 @pytest.mark.untyped
@@ -137,6 +137,19 @@ def test_masks_and_weights_that_do_not_fit(options, told):
     points = np.random.default_rng(0).normal(size=(80, 3))
     with pytest.raises(ValueError, match=told):
         register(points, points, **options)
+
+
+def test_a_mask_that_leaves_rows_which_are_dropped_says_so():
+    points = np.random.default_rng(0).normal(size=(80, 3))
+    holed = points.copy()
+    holed[2:] = np.nan
+    with pytest.raises(ValueError, match="leave 2 points of the reference that are finite"):
+        register(
+            points,
+            np.concatenate([holed, points]),
+            mask=(None, np.arange(160) < 80),
+            nonfinite="drop",
+        )
 
 
 def test_a_box_names_points():

@@ -1,6 +1,7 @@
 """The page: its data against what was put in, and itself in a headless browser."""
 
 import base64
+import dataclasses
 import json
 import re
 import shutil
@@ -14,7 +15,7 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans.result import Alternative, ScanRegistration
 from jaxreg.types import RigidTransform
-from jaxreg.view import page
+from jaxreg.view import page, pictures
 
 POSE = Rotation.from_euler("xyz", [20, -30, 70], degrees=True).as_matrix()
 
@@ -148,6 +149,36 @@ def test_picture_tells_the_true_motion_where_the_source_is_brought_near(tmp_path
     told = page._headline(result, source, shortened=True)
     angle = np.degrees(Rotation.from_matrix(POSE).magnitude())
     assert told[1].startswith(f"turned by {angle:.1f} deg, centroid moved by 1e+07; before: ")
+
+
+def at_another_size(seed, scale):
+    """A source that must become `scale` times as large, its reference, and the registration."""
+    source, reference, translation = scans(seed, count=400)
+    result = registration(source, reference, translation=translation)
+    return source / scale, reference, dataclasses.replace(result, scale=scale)
+
+
+@pytest.mark.parametrize("scale", [0.3, 2.5])
+def test_a_source_at_another_size_ends_on_the_reference(tmp_path, seed, scale):
+    source, reference, result = at_another_size(seed, scale)
+    page.write_registration_page(tmp_path / "r.html", source, reference, result)
+    content = content_of(tmp_path / "r.html")
+    moving, fixed = (points_of(cloud) for cloud in content["clouds"])
+    motion = content["motions"][0]
+    turn = Rotation.from_rotvec(motion["angle"] * np.array(motion["axis"])).as_matrix()
+    aligned = (moving - motion["before"]) @ turn.T + motion["after"]
+    np.testing.assert_allclose(aligned, fixed, atol=3e-4)
+
+
+@pytest.mark.parametrize("scale", [0.3, 2.5])
+def test_so_it_does_in_a_picture(tmp_path, seed, scale, monkeypatch):
+    source, reference, result = at_another_size(seed, scale)
+    drawn = []
+    monkeypatch.setattr(pictures, "plot_pair", lambda *given, **_: drawn.append(given))
+    page.draw_registration(tmp_path / "r.png", source, reference, result)
+    [(moving, fixed, transform, _)] = drawn
+    aligned = moving @ transform.rotation.T + transform.translation
+    np.testing.assert_allclose(aligned, fixed, atol=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,17 @@ import json
 import os
 import zipfile
 
+import chex
 import jax
 import numpy as np
 import pytest
 from flax.traverse_util import unflatten_dict
 
 from jaxreg.config import Config, from_dict
+from jaxreg.evaluation import methods
 from jaxreg.network.model import init_variables
 from jaxreg.peers import by_name
+from jaxreg.training import create_train_state, started_from
 from jaxreg.weights import released
 
 pytestmark = pytest.mark.float32
@@ -70,7 +73,7 @@ def test_the_tree_is_that_of_flax(tmp_path):
 
 def test_an_unknown_name_lists_the_known_ones(tmp_path):
     with pytest.raises(
-        ValueError, match="no released weights 'nothing': choose from idam, modelnet40"
+        ValueError, match="no released weights 'nothing': choose from fmr, idam, modelnet40"
     ):
         released.load_pretrained("nothing")
     with pytest.raises(ValueError, match=r"nothing.npz and .*nothing.json not found: give"):
@@ -80,7 +83,7 @@ def test_an_unknown_name_lists_the_known_ones(tmp_path):
 def test_the_features_of_the_search_are_not_a_network():
     assert "features" not in released.available_weights()
     with pytest.raises(
-        ValueError, match="'features' are not those of a network: choose from idam, mod"
+        ValueError, match="'features' are not those of a network: choose from fmr, idam, mod"
     ):
         released.load_pretrained("features")
     arrays, card = released.load_arrays("features")
@@ -114,7 +117,7 @@ def test_a_pickle_is_never_opened(tmp_path):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_are_small_and_say_where_they_come_from(name):
     content = SHIPPED[name].read_bytes()
-    assert len(content) < 3e6
+    assert len(content) < 4e6
     card = json.loads(SHIPPED[name].with_suffix(".json").read_text("utf-8"))
     assert {"command", "data", "config"} <= set(card)
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
@@ -126,7 +129,25 @@ def test_shipped_networks_fit_the_network_of_their_configuration(name):
     assert {"seed", "step", "validation"} <= set(released.load_card(name))
     variables, config = released.load_pretrained(name)
     fresh = by_name.init_variables(jax.random.key(0), config)
-    assert jax.tree.map(np.shape, fresh) == jax.tree.map(np.shape, variables)
+    # A file has no empty parts, such as the statistics of a network without BatchNorm.
+    shapes, expected = (
+        {jax.tree_util.keystr(path): np.shape(leaf) for path, leaf in leaves}
+        for leaves in map(
+            jax.tree_util.tree_leaves_with_path,
+            (variables, by_name.for_registration(fresh, config)),
+        )
+    )
+    assert shapes == expected
+
+
+@pytest.mark.parametrize("name", ["rpmnet", "fmr"])
+def test_training_starts_from_weights_whose_file_lacks_parts(name):
+    variables, config = released.load_pretrained(name)
+    state = create_train_state(config)
+    started = started_from(name, state)
+    assert jax.tree.structure(started.variables) == jax.tree.structure(state.variables)
+    for part, tree in variables["params"].items():
+        chex.assert_trees_all_equal(started.variables["params"][part], tree)
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "../modelnet40", "a b", "a.b", "möbel", "a\n"])
@@ -152,3 +173,26 @@ def test_a_card_holds_the_configuration_that_was_given(tmp_path):
     card = json.loads(path.read_text("utf-8"))
     assert card["command"] == "c"
     assert card["config"] == json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def test_other_files_beside_weights_are_passed_over(tmp_path, monkeypatch):
+    """A folder of weights may hold other JSON, cards whose weights are gone, and what is cut off."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    save(one, "gone")
+    (one / "gone.npz").unlink()
+    save(one, "cut")
+    (one / "cut.json").write_text('{"config": {"mo')
+    for name, content in (("list", b"[1]"), ("settings", b'{"a": 1}'), ("bytes", b"\xff")):
+        (one / f"{name}.json").write_bytes(content)
+    (one / "folder.json").mkdir()
+    save(one, "mine", alpha=0.1)
+    save(two, "settings", alpha=0.2)
+    shipped = set(released.available_weights())
+    monkeypatch.setenv("JAXREG_WEIGHTS", f"{one}{os.pathsep}{two}")
+    assert set(released.available_weights()) == shipped | {"mine", "settings"}
+    assert released.load_pretrained("settings")[1].model.alpha == 0.2
+    assert "weights:mine" in methods.names()
+    with pytest.raises(ValueError, match="no released weights 'nothing': choose from idam, mine,"):
+        released.load_pretrained("nothing")
+    with pytest.raises(ValueError, match="no released weights 'gone': choose from"):
+        released.load_card("gone")
