@@ -429,6 +429,21 @@ _SHARES = ("bn_momentum", "ema", "exploration", "future", "test_share", "validat
 _LIMITS = {"clip": math.inf, "rotation_max_deg": 360.0} | dict.fromkeys(_SHARES, 1.0)
 
 
+def model_config(config: Config | ModelConfig) -> ModelConfig:
+    """The section of the paper's network.
+
+    Raises:
+      ValueError: it is the configuration of another network.
+    """
+    if not isinstance(config, Config):
+        return config
+    if config.network != "paper":
+        raise ValueError(
+            f"config is that of another network: give it to jaxreg.peers.{config.network}.register."
+        )
+    return config.model
+
+
 def check_options(section: str, settings: Any) -> None:
     """Refuse numbers that make no sense in one section of a configuration, such as `config.model`.
 

@@ -101,9 +101,9 @@ def export_program(
     """Write a registration of two clouds as a program; `load_exported` runs it.
 
     `name` is "register_global", or released weights or the folder of a run, with which
-    `register_pair` is written. `points` are the largest numbers of points (n, m); with `symbolic`,
-    which the search cannot do, any from 256 to 2048. `platforms` are those of JAX: cpu, cuda, rocm,
-    tpu. The file holds the weights. Returns its path.
+    `register_pair` is written, or `register` of another network. `points` are the largest numbers
+    of points (n, m); with `symbolic`, which the search cannot do, any from 256 to 2048. `platforms`
+    are those of JAX: cpu, cuda, rocm, tpu. The file holds the weights. Returns its path.
 
     Raises:
       ValueError: there are no such weights or platforms, the search is asked for symbolic sizes, or
@@ -197,11 +197,11 @@ def _function(name: str) -> Callable[..., Any]:
         return lambda source, reference, source_mask, reference_mask: register_global(
             source, reference, source_mask=source_mask, reference_mask=reference_mask
         )
-    from jaxreg.network.model import register_pair  # Flax, which a loaded program does without
+    from jaxreg.peers import by_name  # Flax, which a loaded program does without
     from jaxreg.weights.released import load_network
 
     variables, config = load_network(name)
-    return lambda source, reference, source_mask, reference_mask: register_pair(
+    return lambda source, reference, source_mask, reference_mask: by_name.register(
         variables, source, reference, config=config,
         source_mask=source_mask, reference_mask=reference_mask,
     )  # fmt: skip

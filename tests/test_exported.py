@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxreg import exported
+from jaxreg.cli import main
 from jaxreg.data.procedural.shapes import sample_shape
 from jaxreg.geometry import rigid
-
-pytest.importorskip("flatbuffers", reason="jax.export saves programs with flatbuffers")
-
-from jaxreg import exported  # noqa: E402
+from jaxreg.weights import released
 
 pytestmark = [pytest.mark.float32, pytest.mark.untyped]
 
@@ -85,6 +84,32 @@ def test_the_network_gives_what_it_gave_before_it_was_saved(tmp_path, seed, symb
         found, want = program(source[:count], reference), one(source[:count], reference)
         np.testing.assert_allclose(found.rotation, want.rotation, atol=1e-3)
         assert found.confidence.shape == (count,)
+
+
+def test_another_network_gives_what_its_register_gives(tmp_path, seed):
+    from jaxreg import load_pretrained
+    from jaxreg.peers import fmr
+
+    program = exported.load_exported(
+        exported.export_program(tmp_path / "p", "fmr", points=(64, 64))
+    )
+    variables, config = load_pretrained("fmr")
+    source, reference, _ = turned_pair(seed, 64)
+    found = program(source[:60], reference)
+    want = jax.jit(lambda x, y: fmr.register(variables, x, y, config=config))(
+        source[:60], reference
+    )
+    np.testing.assert_allclose(found.rotation, want.rotation, atol=1e-3)
+    assert found.confidence.shape == (60,)
+
+
+def test_a_program_is_not_written_over_the_weights_that_it_is_made_of(tmp_path):
+    for path in released.weight_files("fmr"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    weights = tmp_path / "fmr.npz"
+    before = weights.read_bytes()
+    assert main(["export", str(tmp_path / "fmr"), "-o", str(weights)]) == 2
+    assert weights.read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ class Export:
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
     """register_global (any start, no weights), or released weights or the folder of a run: then it is
-    register_pair with these."""
+    register_pair with these, or the register of another network."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """Write the program here."""
     points: Annotated[tuple[int, int], tyro.conf.arg(metavar="N M")] = (1024, 1024)
@@ -35,7 +35,7 @@ class Export:
         from jaxreg import io
         from jaxreg.exported import export_program
 
-        io.check_place(self.output, [])
+        io.check_place(self.output, _weights_of(self.name))
         with io.whole(self.output) as part:
             export_program(
                 part,
@@ -50,3 +50,11 @@ class Export:
         line("platforms", ", ".join(self.platform))
         line("wrote", f"{self.output} ({self.output.stat().st_size / 1000:.0f} kB)")
         return SUCCESS
+
+
+def _weights_of(name: str) -> tuple[Path, ...]:
+    """The files that a program of this name is made of, if they are weights."""
+    from jaxreg.exported import GLOBAL
+    from jaxreg.weights.released import weight_files
+
+    return () if name == GLOBAL or (Path(name) / "best").is_dir() else weight_files(name)

@@ -278,7 +278,7 @@ def check_columns(paths: Sequence[Path], scans: Sequence["Scan"]) -> None:
 
 def _has_height(points: np.ndarray) -> bool:
     height = points[np.isfinite(points).all(axis=1), 2]
-    return len(height) > 0 and np.ptp(height) > 0
+    return len(height) > 0 and bool(np.ptp(height) > 0)
 
 
 def _write_results(

@@ -170,7 +170,8 @@ def _identity(
     }
     return {
         "version": __version__,
-        "method": kind + (f" + {refine}" if refine else ""),
+        "method": kind,
+        "refine": refine,
         "network": settings,
         "weights": weights,
         "transforms": None if given is None else digest(given),

@@ -14,7 +14,7 @@ _COLORS = ("red", "green", "blue")
 
 
 def read_colors(
-    paths: Sequence[Path], clouds: Sequence[Float[np.ndarray, "n 3"]]
+    paths: Sequence[Path], clouds: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> np.ndarray | None:
     """The colours (n, 3) uint8 of the finite points of PLY files in turn; None if none has any.
 

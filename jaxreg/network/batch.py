@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax import dtypes
 
-from jaxreg.config import Config, ModelConfig
+from jaxreg.config import Config, ModelConfig, model_config
 from jaxreg.geometry.clouds import sizes_of_pair
 from jaxreg.network.model import Variables, register_pair
 from jaxreg.types import Registration
@@ -50,7 +50,7 @@ def register_batch(
       ValueError: there are more sources than references, or fewer; a cloud is not (n, 3) of floats
         (the message names it by its number); or what `register_pair` raises.
     """
-    model = config.model if isinstance(config, Config) else config
+    model = model_config(config)
     together = together or (1 if jax.default_backend() == "cpu" else _TOGETHER)
     pairs = _padded_pairs(sources, references, source_masks, reference_masks)
     while window := list(

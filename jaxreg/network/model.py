@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.batching import one_at_a_time
-from jaxreg.config import Config, ModelConfig, check_options
+from jaxreg.config import Config, ModelConfig, check_options, model_config
 from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_sqrt
@@ -333,7 +333,7 @@ def register_pair(
 ) -> Registration:
     """Register two clouds with a trained network; pure: jit, vmap and differentiate it.
 
-    `config` describes the network; in a whole configuration only `model` is read.
+    `config` describes the network; in a whole configuration only `network` and `model` are read.
 
     Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
     outside a mask are padding and have no effect, even if they are NaN. With no valid point in a
@@ -350,7 +350,7 @@ def register_pair(
         variables,
         moving,
         fixed,
-        config=config.model if isinstance(config, Config) else config,
+        config=model_config(config),
         observe=lambda step, graph: (step.confidence, step.matches.copy),
     )
     valid = source_usable & reference_usable

@@ -4,13 +4,13 @@ from types import ModuleType
 from typing import Any
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxreg.config import Config
 from jaxreg.network import model
 from jaxreg.network.model import Variables
 from jaxreg.peers import cemnet, dcp, fmr, idam, rpmnet
-from jaxreg.types import PointCloud, RigidTransform
+from jaxreg.types import PointCloud, Registration, RigidTransform
 
 _PEERS: dict[str, ModuleType] = {
     "dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet, "fmr": fmr,
@@ -47,24 +47,34 @@ def for_training(variables: Variables, fresh: Variables, config: Config) -> Vari
     return empty | variables | {"params": variables["params"] | added}
 
 
+def register(
+    variables: Variables,
+    source: Float[Array, "n 3"],
+    reference: Float[Array, "m 3"],
+    *,
+    config: Config,
+    source_mask: Bool[Array, "n"] | None = None,
+    reference_mask: Bool[Array, "m"] | None = None,
+) -> Registration:
+    """`jaxreg.register_pair`, or the `register` of a peer."""
+    own = config.network == "paper"
+    function = model.register_pair if own else _PEERS[config.network].register
+    return function(
+        variables, source, reference, config=config,
+        source_mask=source_mask, reference_mask=reference_mask,
+    )  # fmt: skip
+
+
 def pose(
     variables: Variables, source: PointCloud, reference: PointCloud, *, config: Config
 ) -> RigidTransform:
     """The transform from source to reference."""
     if config.network == "paper":
         return model.iterate(variables, source, reference, config=config.model)[0]
-    return (
-        _PEERS[config.network]
-        .register(
-            variables,
-            source.points,
-            reference.points,
-            config=config,
-            source_mask=source.mask,
-            reference_mask=reference.mask,
-        )
-        .transform
-    )
+    return register(
+        variables, source.points, reference.points, config=config,
+        source_mask=source.mask, reference_mask=reference.mask,
+    ).transform  # fmt: skip
 
 
 def loss(

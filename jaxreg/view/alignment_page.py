@@ -19,7 +19,7 @@ _FEWEST = 500
 
 def write_alignment_page(
     path: str | Path,
-    clouds: Sequence[Float[np.ndarray, "n 3"]],
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
     alignment: Alignment,
     *,
     names: Sequence[str],
@@ -49,7 +49,7 @@ def write_alignment_page(
 
 def draw_alignment(
     path: str | Path,
-    clouds: Sequence[Float[np.ndarray, "n 3"]],
+    clouds: Sequence[Float[np.ndarray, "_ 3"]],
     alignment: Alignment,
     *,
     names: Sequence[str],
@@ -64,7 +64,7 @@ def draw_alignment(
         [colour(k) for k in members],
         path,
         title=summary.verdict(alignment),
-        labels=[Path(names[k]).name for k in members],
+        labels=[page.encodable(Path(names[k]).name) for k in members],
     )
 
 

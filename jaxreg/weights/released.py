@@ -37,8 +37,9 @@ def available_weights() -> tuple[str, ...]:
 
 def _is_network(name: str) -> bool:
     """Whether a JSON file of this name is a network's card; other files may lie beside weights."""
+    files = _found(name)
     try:
-        return "model" in load_card(name)["config"]
+        return files is not None and "model" in _read_card(files[1])["config"]
     except ValueError:
         return False
 
@@ -88,7 +89,10 @@ def load_arrays(name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def load_card(name: str) -> dict[str, Any]:
     """How the weights were made: `command`, `data`, `config`; raises what `load_arrays` raises."""
-    _, path = weight_files(name)
+    return _read_card(weight_files(name)[1])
+
+
+def _read_card(path: Path) -> dict[str, Any]:
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -147,12 +151,9 @@ def weight_files(name: str) -> tuple[Path, Path]:
     Raises:
       ValueError: there are no such weights (the message lists the names).
     """
-    is_path = Path(name).name != name
-    for folder in [Path()] if is_path else _folders():
-        arrays, card = folder / f"{name}.npz", folder / f"{name}.json"
-        if arrays.is_file() and card.is_file():
-            return arrays, card
-    if is_path:
+    if files := _found(name):
+        return files
+    if _is_path(name):
         raise ValueError(
             f"{name}.npz and {name}.json not found: give their common path without a suffix."
         )
@@ -160,6 +161,18 @@ def weight_files(name: str) -> tuple[Path, Path]:
         f"no released weights '{name}': choose from {', '.join(available_weights()) or 'none'}, give "
         f"the path of your own without a suffix, or set ${_VARIABLE} to their directory."
     )
+
+
+def _found(name: str) -> tuple[Path, Path] | None:
+    for folder in [Path()] if _is_path(name) else _folders():
+        arrays, card = folder / f"{name}.npz", folder / f"{name}.json"
+        if arrays.is_file() and card.is_file():
+            return arrays, card
+    return None
+
+
+def _is_path(name: str) -> bool:
+    return Path(name).name != name
 
 
 def _nested(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:

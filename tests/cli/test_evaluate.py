@@ -190,7 +190,8 @@ def test_the_figures_are_out_before_anything_that_may_fail(command, monkeypatch)
 )
 def test_an_output_is_whole_or_as_it_was(command, monkeypatch, option, place):
     def half(path):
-        path.open("w").write("half")
+        with path.open("w") as file:
+            file.write("half")
         raise OSError(28, "No space left on device")
 
     Path(place).write_text("an older one")

@@ -126,6 +126,22 @@ def test_moved_ply_keeps_colours_turns_normals_and_widens_coordinates(tmp_path):
     assert PlyData.read(str(tmp_path / "b.ply")).obj_info == ["num_cols 512"]
 
 
+COLORS = ("red", "green", "blue")
+
+
+def test_colours_of_scans_of_any_size_follow_each_other(tmp_path):
+    paths = [tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "c.xyz"]
+    for path, count, red in zip(paths, (2, 3, 1), (7, 8, None), strict=True):
+        io.write_cloud(path, np.ones((count, 3)))
+        if red:
+            rows = np.full(count, red, [*((a, "f4") for a in "xyz"), *((c, "u1") for c in COLORS)])
+            PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
+    clouds = [io.read_cloud(path) for path in paths]
+    for _ in range(20):  # the check of types looks at one cloud, by chance
+        found = io.read_colors(paths, clouds)
+    np.testing.assert_array_equal(found, np.repeat([[7], [8], [128]], [2, 3, 1], 0) * [[1, 1, 1]])
+
+
 @pytest.mark.parametrize(
     "content",
     [

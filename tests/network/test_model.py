@@ -398,6 +398,12 @@ def batch_of(pairs, rows, fill):
 
 
 @pytest.mark.slow
+def test_the_configuration_of_another_network_is_refused(rng):
+    clouds = jnp.asarray(rng.normal(size=(2, 30, 3)), jnp.float32)
+    with pytest.raises(ValueError, match="another network: give it to jaxreg.peers.idam.register"):
+        register_pair({}, *clouds, config=Config(network="idam"))
+
+
 def test_padding_changes_neither_the_training_loss_nor_its_gradient(rng):
     """T18."""
     variables = variables_of(SMALL)

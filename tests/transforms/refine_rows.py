@@ -90,7 +90,6 @@ def small_parts() -> dict[str, Row]:
             (RNG.normal(size=3),),
             ((zero,), (np.array([1e-9, 0, 0]),), (np.array([0.0, np.pi, 0]),)),
         ),
-        "refine.gauss_newton.skew": Row(gauss_newton.skew, (RNG.normal(size=3),)),
         "geometry.normals.neighborhood_covariances": Row(
             normals.neighborhood_covariances, (points(), graph), every(lambda x: (x, graph))
         ),

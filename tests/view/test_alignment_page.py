@@ -1,5 +1,7 @@
 """The page of many scans: its data against what was put in."""
 
+import os
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -65,6 +67,18 @@ def test_a_picture_is_drawn(alignment, tmp_path, seed):
     clouds = [rng.normal(size=(100, 3)) for _ in NAMES]
     draw_alignment(tmp_path / "p.png", clouds, alignment, names=NAMES)
     assert imread(tmp_path / "p.png").ndim == 3
+
+
+def test_names_that_are_not_utf8_are_drawn_and_written_as_far_as_they_are(
+    alignment, tmp_path, seed
+):
+    rng = np.random.default_rng(seed)
+    clouds = [rng.normal(size=(10 + k, 3)) for k in range(4)]
+    names = [os.fsdecode(b"sc\xe4n%d.ply" % k) for k in range(4)]
+    draw_alignment(tmp_path / "p.png", clouds, alignment, names=names)
+    assert imread(tmp_path / "p.png").ndim == 3
+    write_alignment_page(tmp_path / "p.html", clouds, alignment, names=names)
+    assert [cloud["name"] for cloud in content_of(tmp_path / "p.html")["clouds"]] == names[:3]
 
 
 def test_colours_of_a_hundred_scans_differ():
