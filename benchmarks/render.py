@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 
-import jinja2
 import tyro
 
 from benchmarks.record import FOLDER, Value
@@ -144,7 +143,9 @@ def _field(records: dict[str, dict], field: str, name: str) -> str:
     return records[name][field]
 
 
-def _environment(records: dict[str, dict]) -> jinja2.Environment:
+def _environment(records: dict[str, dict]):
+    import jinja2  # of the extra `dev`; a benchmark that prints a table does without
+
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, keep_trailing_newline=True, finalize=number
     )
