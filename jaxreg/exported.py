@@ -122,9 +122,10 @@ def export_program(
     if not symbolic and min(points) < 16:
         raise ValueError(f"points = {points}: a cloud needs 16 points or more.")
     sizes = _symbols() if symbolic else points
+    least = LEAST if symbolic else min(points)
     clouds = [jax.ShapeDtypeStruct((size, 3), jnp.float32) for size in sizes]
     masks = [jax.ShapeDtypeStruct((size,), jnp.bool_) for size in sizes]
-    program = export.export(jax.jit(_function(name)), platforms=platforms)(*clouds, *masks)
+    program = export.export(jax.jit(_function(name, least)), platforms=platforms)(*clouds, *masks)
     card = {
         "version": VERSION,
         "name": name,
@@ -190,7 +191,8 @@ def _symbols() -> tuple[Any, ...]:
     return tuple(export.symbolic_shape("n, m", constraints=bounds))
 
 
-def _function(name: str) -> Callable[..., Any]:
+def _function(name: str, least: int) -> Callable[..., Any]:
+    """The function of a name, for clouds of at least so many rows."""
     if name == GLOBAL:
         from jaxreg.search.pipeline import register_global
 
@@ -201,6 +203,10 @@ def _function(name: str) -> Callable[..., Any]:
     from jaxreg.weights.released import load_network
 
     variables, config = load_network(name)
+    if config.network == "paper" and least < config.model.n_inliers:
+        raise ValueError(
+            f"{name} keeps {config.model.n_inliers} correspondences: give points of that many or more."
+        )
     return lambda source, reference, source_mask, reference_mask: by_name.register(
         variables, source, reference, config=config,
         source_mask=source_mask, reference_mask=reference_mask,

@@ -119,6 +119,7 @@ def test_a_program_is_not_written_over_the_weights_that_it_is_made_of(tmp_path):
         ({"platforms": ("gpu",)}, "'gpu'.*choose from cpu, cuda"),
         ({"platforms": ()}, "no platform is given: choose from cpu, cuda"),
         ({"points": (4, 100)}, "16 points or more"),
+        ({"name": "modelnet40", "points": (128, 300)}, "modelnet40 keeps 256 correspondences"),
         ({"name": "no_such_weights"}, "no_such_weights"),
     ],
 )

@@ -196,7 +196,8 @@ def _write(
         if path is not None:
             with io.whole(path) as part:
                 write(part)
-            told.append(("wrote", str(path)))
+            apart = len(alignment.groups) > 1 and path == command.poses
+            told.append(("wrote", f"{path}{' (each group in a frame of its own)' * apart}"))
 
 
 def _write_merged(

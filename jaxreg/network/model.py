@@ -306,8 +306,8 @@ def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
     """The weights in the precision of the clouds; those that training updates stay as they are."""
     if not {"params", "batch_stats"} <= set(variables):
         raise ValueError(
-            f"variables have the keys {sorted(variables)}: give both params and batch_stats, as "
-            "jaxreg.load_pretrained returns them."
+            f"variables have the keys {sorted(variables)}: give both params and batch_stats, of "
+            "the network that config describes, as jaxreg.load_pretrained returns them."
         )
     if train:
         try:

@@ -8,7 +8,16 @@ Variables = dict[str, Any]
 def run_network(
     module: Any, name: str, variables: Variables, *inputs: Any, train: bool
 ) -> tuple[Any, Variables]:
-    """Apply a network; returns its output and `variables` with the statistics it updated."""
+    """Apply a network; returns its output and `variables` with the statistics it updated.
+
+    Raises:
+      ValueError: `variables` are those of another network.
+    """
+    if lacking := [kind for kind, tree in variables.items() if name not in tree]:
+        raise ValueError(
+            f"variables have no '{name}' in {lacking[0]}, so they are those of another network than "
+            "config's: give both as jaxreg.load_pretrained returns them."
+        )
     own = {kind: tree[name] for kind, tree in variables.items()}
     if not train:
         return module.apply(own, *inputs, train=False), variables

@@ -139,7 +139,7 @@ def register_many(
     clouds: Sequence[object],
     *,
     order: Literal["unknown", "sequence"] | Sequence[float] = "unknown",
-    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | None = None,
+    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | Alignment | None = None,
     viewpoints: Sequence[object] | None = None,
     nonfinite: Literal["raise", "drop"] = "raise",
     strays: Literal["drop", "keep", "raise"] = "drop",
@@ -158,8 +158,9 @@ def register_many(
     looked for; an `order` of numbers, one a scan, are the times at which the scans were taken (any
     unit): neighbours are then those in time, unless ten times the usual step lies between them.
     `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None; NaN is None), all in
-    one frame. `viewpoints` say where the scanner of each scan stood (3,), in the coordinates of the
-    scan, None where unknown: see `jaxreg.prepare`. `joint` refines all poses together at the end.
+    one frame, or an earlier `Alignment` of one group. `viewpoints` say where the scanner of each scan
+    stood (3,), in the coordinates of the scan, None where unknown: see `jaxreg.prepare`. `joint`
+    refines all poses together at the end.
     With `work`, a folder, prepared scans and finished pairs are kept there, and a run with the same
     scans and settings goes on where the last one ended. Pairs run on `executor` (any of
     `concurrent.futures`, Dask's, Ray's or mpi4py's; `work` must then be a folder that its workers
@@ -227,14 +228,15 @@ def _checked_times(order: object, count: int) -> Float[np.ndarray, "n"] | None:
 
 
 def _checked_starts(
-    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | None, count: int
+    initial: Sequence[object] | Float[np.ndarray, "n 4 4"] | Alignment | None, count: int
 ) -> list[np.ndarray | None]:
     if initial is None:
         return [None] * count
-    if len(initial) != count:
-        raise ValueError(f"{len(initial)} initial poses for {count} scans: give one each, or None.")
+    poses = initial.transformation if isinstance(initial, Alignment) else initial
+    if len(poses) != count:
+        raise ValueError(f"{len(poses)} initial poses for {count} scans: give one each, or None.")
     starts: list[np.ndarray | None] = []
-    for k, pose in enumerate(initial):
+    for k, pose in enumerate(poses):
         given = None if pose is None else pose_parts(pose, f"initial[{k}]")
         # As `Alignment.transformation` has it for a scan that was not placed.
         if given is None or all(np.isnan(part).all() for part in given):

@@ -52,11 +52,15 @@ def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
         array = np.asarray(weights, np.float64)
     except (TypeError, ValueError):
         array = np.zeros(0)
-    if array.shape != (count,) or not (np.isfinite(array).all() and np.all(array >= 0)):
+    if array.shape != (count,):
         raise ValueError(
             f"weights must be {count} numbers of 0 or more, one for each point of the source, got "
             f"shape {array.shape}."
         )
+    wrong = ~(np.isfinite(array) & (array >= 0))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise ValueError(f"weight {row} is {array[row]}: give finite numbers of 0 or more.")
     return array
 
 

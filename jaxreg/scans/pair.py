@@ -1,17 +1,22 @@
 """Register two scans: numpy in, numpy out, any sizes and any unit."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
+from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import ScanRegistration, widened
 from jaxreg.types import RigidTransform
+
+_BEYOND_DEG = 1.0
+"""The refinement of a pose at the limit may turn it so much farther."""
 
 
 def register(
@@ -40,8 +45,8 @@ def register(
 
     `initial` (4x4 or a `RigidTransform`) starts from a known pose. The search is skipped, so
     `alternatives` is empty and the verdict does without rival poses. `max_rotation_deg` is the
-    largest rotation to consider (None: any); it decides between the poses of a symmetric shape, and
-    bounds a start, but not its refinement.
+    largest rotation to consider (None: any); it decides between the poses of a symmetric shape, and a
+    result beyond it by more than a degree is no success.
     `known` says what is known of the pair: "upright", both scans have the axis `up` ("x", "y", "z"
     or a vector) upwards, so that the source is turned about it alone; "inside", the source lies
     wholly in the reference, which shows far more; or both. With `scale` the size of the source is
@@ -128,10 +133,25 @@ def register_prepared(
     if flat := planar.is_planar(source, reference):
         known = known._replace(up=planar.UP)
     if not scale:
-        return _of_one_size(source, reference, config, start, known, least, thorough)
+        found = _of_one_size(source, reference, config, start, known, least, thorough)
+        return _within_limit(found, known)
     if few.is_few(source, reference):
         raise ValueError("scale=True needs surfaces, clouds of more than 60 points: leave it out.")
-    return similar.registered(source, reference, config, start, known, run=_of_one_size, flat=flat)
+    run = _of_one_size
+    found = similar.registered(source, reference, config, start, known, run=run, flat=flat)
+    return _within_limit(found, known)
+
+
+def _within_limit(found: ScanRegistration, known: Known) -> ScanRegistration:
+    """The result, no success if it turns farther than is allowed: then no other pose was found."""
+    turned = float(rotation_angle_deg(found.rotation, np.eye(3)))
+    if turned <= known.max_rotation_deg + _BEYOND_DEG:
+        return found
+    reason = (
+        f"The best pose that was found turns by {turned:.3g} degrees, more than max_rotation_deg = "
+        f"{known.max_rotation_deg:g}."
+    )
+    return dataclasses.replace(found, success=False, probability=0.0, reason=reason)
 
 
 def _of_one_size(

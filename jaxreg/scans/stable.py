@@ -41,7 +41,7 @@ class Settled(NamedTuple):
     """A pose of the centred clouds in the unit of the input, and its covariance about the origin.
 
     `stayed` is the share of the compared points on which it rests, `gain` how many times as many
-    points agree to within the noise as did before.
+    points agree to within the noise as did before, each as much as it counts.
     """
 
     pose: RigidTransform
@@ -53,6 +53,11 @@ class Settled(NamedTuple):
     def better(self) -> bool:
         """Whether clearly more points agree than before."""
         return self.gain >= _GAIN
+
+    @property
+    def no_worse(self) -> bool:
+        """Whether more points agree than before: enough where somebody said how much they count."""
+        return self.gain > 1
 
     @property
     def doubt(self) -> str:
@@ -102,7 +107,9 @@ def settled(
         second, finer, found.pose, 1.5 * noise * narrow[-1:], weights=stays, motions=motions
     )
     before = planes.fitted(second, finer, start, np.zeros(0), motions=motions)
-    agree, agreed = (np.sum(one.over & (np.abs(one.off) < noise)) for one in (found, before))
+    agree, agreed = (
+        np.sum(given[many] * (one.over & (np.abs(one.off) < noise))) for one in (found, before)
+    )
     # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
     drawn = _difference(wider.pose, found.pose)
     covariance = found.covariance[:6, :6] + np.outer(drawn, drawn)
@@ -111,7 +118,7 @@ def settled(
         RigidTransform(found.pose.rotation, found.pose.translation * unit),
         covariance * np.outer(units, units),
         float(np.mean(stays[found.over] > 0.5)) if found.over.any() else 0.0,
-        float(agree / max(agreed, 1)),
+        float(agree / max(agreed, _LEAST)),
     )
 
 

@@ -277,7 +277,9 @@ def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Cl
     if problem.config.refine is not None:
         reach = problem.reach() * float(problem.where.length)
         settled = stable.settled(source, reference, pose, reach, known=problem.known)
-        settled = settled if settled.better or weights is not None else None
+        # Where the points are few, patches of the surface are coarser than what was found before.
+        given = weights is not None and settled.no_worse
+        settled = settled if settled.better or given else None
     if settled is not None:
         pose, now = settled.pose, dense.agreement(source, reference, settled.pose)
     cause = ""

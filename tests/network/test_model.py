@@ -16,6 +16,7 @@ from jaxreg.network import losses
 from jaxreg.network.features import BATCH_AXIS
 from jaxreg.network.model import init_variables, iterate, register_pair
 from jaxreg.types import PointCloud
+from jaxreg.weights.released import load_pretrained
 from tests import oracles
 from tests.compiled import knn
 from tests.scenes import assert_proper, draw_pair, variables_of
@@ -402,6 +403,14 @@ def test_the_configuration_of_another_network_is_refused(rng):
     clouds = jnp.asarray(rng.normal(size=(2, 30, 3)), jnp.float32)
     with pytest.raises(ValueError, match="another network: give it to jaxreg.peers.idam.register"):
         register_pair({}, *clouds, config=Config(network="idam"))
+
+
+def test_weights_of_another_network_are_refused(rng):
+    clouds = jnp.asarray(rng.normal(size=(2, 300, 3)), jnp.float32)
+    variables, _ = load_pretrained("idam")
+    _, config = load_pretrained("modelnet40")
+    with pytest.raises(ValueError, match="'features' in .* those of another network"):
+        register_pair(variables, *clouds, config=config)
 
 
 def test_padding_changes_neither_the_training_loss_nor_its_gradient(rng):

@@ -87,3 +87,14 @@ def test_a_start_beyond_the_limit_is_refused():
     start[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()
     with pytest.raises(ValueError, match="initial turns by 90 degrees, more than max_rotation_deg"):
         register(cloud, cloud, initial=start, max_rotation_deg=30)
+
+
+def test_a_pose_beyond_the_limit_is_no_success():
+    """Exact copies: the one pose that fits turns by 40 degrees."""
+    cloud = shapes.sample_shape(5, 10, points=600).astype(np.float64)
+    turn = Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    found = register(cloud, moved(cloud, turn, np.zeros(3)), max_rotation_deg=10)
+    assert not found.success
+    assert found.probability == 0
+    assert found.reason
+    assert register(cloud, moved(cloud, turn, np.zeros(3)), max_rotation_deg=45).success

@@ -100,6 +100,8 @@ def test_poses_of_an_alignment_are_starts_and_nan_is_none(scans, alignment):
     starts = many._checked_starts(alignment.transformation, 5)
     assert [start is None for start in starts] == [False] * 4 + [True]
     np.testing.assert_allclose(starts[1], alignment.transformation[1], atol=1e-12)
+    again = many._checked_starts(alignment, 5)
+    np.testing.assert_array_equal(again[1], starts[1])
 
 
 def test_a_second_run_goes_on_where_the_first_ended(scans, alignment, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from jaxreg.scans import masks, prepare, stable
 from jaxreg.scans.known import Known
 from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
-from tests.scenes import moved
+from tests.scenes import angle_deg, moved
 
 TILT = Rotation.from_euler("xyz", [0.1, 0.2, 1.5], degrees=True).as_matrix()
 SHIFT = np.array([1.0, -2.0, 0.5])
@@ -128,7 +128,7 @@ def test_a_mask_and_a_weight_of_zero_say_what_moved():
         ({"mask": (None, np.ones(5, bool))}, "the mask of the reference is bool"),
         ({"mask": np.zeros(80, bool)}, "leave 0 points of the source"),
         ({"weights": np.ones(5)}, "80 numbers of 0 or more"),
-        ({"weights": -np.ones(80)}, "80 numbers of 0 or more"),
+        ({"weights": -np.ones(80)}, "weight 0 is -1.0: give finite numbers of 0 or more"),
         ({"weights": np.zeros(80)}, "leave 0 points of the source"),
     ],
 )
@@ -150,6 +150,17 @@ def test_a_mask_that_leaves_rows_which_are_dropped_says_so():
             mask=(None, np.arange(160) < 80),
             nonfinite="drop",
         )
+
+
+@pytest.mark.parametrize("count", [1024, 1450])
+def test_weights_of_one_change_nothing_of_a_sparse_cloud(count, seed):
+    """An exact copy: its pose is known to the last digits without them."""
+    direction = np.random.default_rng(seed).normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    x, y, z = direction.T
+    points = direction * (1 + 0.2 * np.sin(3 * x + 1) * np.cos(4 * y) + 0.15 * z**3)[:, None]
+    found = register(points, moved(points, TILT, SHIFT), weights=np.ones(count))
+    assert angle_deg(found.rotation, TILT) < 0.05
 
 
 def test_a_box_names_points():
