@@ -98,7 +98,7 @@ def choose(name: str, *, model: ModelConfig | None = None) -> Method:
             return _traced(_global(None))
         case "register_global_learned":
             return _traced(_global(load_features()))
-    if _is_network(name):
+    if is_network(name):
         return _network(*load_network_of(name), model)
     if name.partition("@")[0] in baselines.NAMES:
         function = baselines.choose(name)
@@ -121,13 +121,14 @@ def trained_config(name: str) -> Config | None:
 
     Raises what `load_network_of` raises. The arrays of a checkpoint are not read.
     """
-    if not _is_network(name):
+    if not is_network(name):
         return None
     kind, _, place = name.partition(":")
     return best_config(place)[0] if kind == "checkpoint" else load_network_of(name)[1]
 
 
-def _is_network(name: str) -> bool:
+def is_network(name: str) -> bool:
+    """Whether a name is that of weights, of a file of them, or of a run; nothing is read."""
     kind, colon, place = name.partition(":")
     return kind in _LOADERS and bool(colon and place)
 

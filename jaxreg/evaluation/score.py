@@ -157,7 +157,7 @@ def _identity(
 ) -> dict[str, Any]:
     """All that the results follow from: what is in the files, wherever they lie on a host."""
     kind, settings, weights = name or "transforms", None, None
-    if methods.trained_config(name):
+    if methods.is_network(name):
         variables, trained = methods.load_network_of(name)
         section = "model" if trained.network == "paper" else trained.network
         kind = name.partition(":")[0]

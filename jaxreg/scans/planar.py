@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxreg.geometry import clouds as checks
 from jaxreg.geometry import trees
@@ -65,15 +65,11 @@ _ALIKE, _RAREST = 0.95, 0.02
 
 
 class Line(NamedTuple):
-    """A cloud in the plane, around its centre in units of its radius, at two densities, indexed.
-
-    `nearest_point` is the number of the nearest point of the cloud itself.
-    """
+    """A cloud in the plane, around its centre in units of its radius, at two densities, indexed."""
 
     points: Float[np.ndarray, "n 3"]
     surface: planes.Surface
     normals: Float[np.ndarray, "n 3"]
-    nearest_point: Int[np.ndarray, "n"]
     judged: Float[np.ndarray, "j 3"]
     judged_tree: trees.Tree
     examined: Examined
@@ -118,15 +114,19 @@ def registered(
     )
     chances = chances_of(ranked.score[order])
     judged = jax.tree.map(lambda leaf: float(leaf[best]), ranked.evidence)
-    weights = None if known.weights is None else known.weights[x.nearest_point]
+    weights = known.weights
+    if weights is not None:
+        weights = weights[trees.nearest(source.tree, source.fine.points)[1]]
     fit = _closed(x, y, ratio, pose, config, weights)
     accuracy = _accuracy(fit, reference, config)
     free = bool(accuracy.weak_directions)
     chance = 0.0 if free else float(chances[0])
     rivals = chances[1:]
     success = verdict.is_success(chance, rivals, accuracy.converged)
-    in_front = float(free_space.share_in_front(_stacked([fit.pose]))[0])
-    reason = "" if success else _reason(judged, accuracy, float(rivals.sum()), in_front)
+    reason = ""
+    if not success:
+        in_front = float(free_space.share_in_front(_stacked([fit.pose]))[0])
+        reason = _reason(judged, accuracy, float(rivals.sum()), in_front)
     spacing = max(
         float(x.examined.spacing) * source.radius, float(y.examined.spacing) * reference.radius
     )
@@ -152,15 +152,11 @@ def _line(cloud: Prepared) -> Line:
     surface = planes.Surface(points, tree, count=_NEIGHBORS, flat=True)
     normals = cloud.fine.normals
     normals = surface.next_to(points).normal if normals is None else normals
-    nearest_point = trees.nearest(cloud.tree, cloud.fine.points)[1]
     judged = reduce_to(points, _JUDGED)
     noise = planes.patches(points, tree, judged, count=_NEIGHBORS, flat=True).noise
     judged_tree = trees.Tree(judged)
     examined = _examined(judged, judged_tree, cloud)
-    return Line(
-        points, surface, normals, nearest_point, judged, judged_tree, examined,
-        float(np.median(noise)),
-    )  # fmt: skip
+    return Line(points, surface, normals, judged, judged_tree, examined, float(np.median(noise)))
 
 
 def _examined(points: Float[np.ndarray, "j 3"], tree: trees.Tree, cloud: Prepared) -> Examined:

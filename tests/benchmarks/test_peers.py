@@ -4,22 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import peers, printed
-from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
+from jaxreg.config import Config, DataConfig, PairConfig
 from jaxreg.evaluation import methods
 from jaxreg.training import train
 from jaxreg.weights.released import load_card
-from tests.peers.small import SMALL
+from tests.peers.small import short_training
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
-
-TINY = Config(
-    network="fmr",
-    fmr=SMALL["fmr"],
-    data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
-    pairs=PairConfig(points=32, kept=24),
-    test_pairs=PairConfig(points=32, kept=24),
-    train=TrainConfig(steps=2, batch=2, validate_every=1, validation_pairs=2),
-)
 
 
 def test_every_method_has_a_name_and_every_column_a_configuration(data_root):
@@ -78,7 +69,7 @@ def of_shapes(column, root):
 def test_a_run_has_a_row_with_its_budget_and_the_record_fits_the_page(
     records, monkeypatch, tmp_path, capsys
 ):
-    train(TINY, tmp_path)
+    train(short_training("fmr"), tmp_path)
     monkeypatch.setattr(peers, "column_config", of_shapes)
     runs = (f"fmr={tmp_path}",)
     peers.main(peers.Options("", runs, ("fmr=0.5",), pairs=2, methods=("fmr",)))

@@ -1,9 +1,19 @@
-"""The peers with small networks, and random weights for them in float64."""
+"""The peers with small networks, a short training, and random weights for them in float64."""
 
 import jax
 import numpy as np
 
-from jaxreg.config import CEMNetConfig, DCPConfig, FMRConfig, IDAMConfig, RPMNetConfig
+from jaxreg.config import (
+    CEMNetConfig,
+    Config,
+    DataConfig,
+    DCPConfig,
+    FMRConfig,
+    IDAMConfig,
+    PairConfig,
+    RPMNetConfig,
+    TrainConfig,
+)
 from jaxreg.peers import cemnet, dcp, fmr, idam, rpmnet
 
 K = 3
@@ -21,6 +31,18 @@ SMALL = {
     "fmr": FMRConfig(channels=(8, 24), hidden=(6,), decoded=5, iterations=2),
 }  # fmt: skip
 MODULES = {"dcp": dcp, "cemnet": cemnet, "idam": idam, "rpmnet": rpmnet, "fmr": fmr}
+
+
+def short_training(name: str) -> Config:
+    """Two steps on two pairs of procedural shapes."""
+    return Config(
+        network=name,
+        data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
+        pairs=PairConfig(points=32, kept=24),
+        test_pairs=PairConfig(points=32, kept=24),
+        train=TrainConfig(steps=2, batch=2, validate_every=1, validation_pairs=2),
+        **{name: SMALL[name]},
+    )
 
 
 def draw_variables(module, config, rng):

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.config import Config, DataConfig, PairConfig, TrainConfig
+from jaxreg.config import Config
 from jaxreg.evaluation import methods
 from jaxreg.peers import by_name, fmr
 from jaxreg.training import create_train_state, release, started_from, train
 from jaxreg.types import Pair, PointCloud, RigidTransform
 from jaxreg.weights.checkpoint import load_checkpoint
 from jaxreg.weights.released import load_pretrained
-from tests.peers.small import SMALL
+from tests.peers.small import SMALL, short_training
 
 pytestmark = [pytest.mark.float32, pytest.mark.loose]
 
@@ -21,14 +21,7 @@ pytestmark = [pytest.mark.float32, pytest.mark.loose]
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in by_name.TRAINED if n != "paper"])
 def test_two_steps_a_checkpoint_and_a_method(name, tmp_path):
-    config = Config(
-        network=name,
-        data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
-        pairs=PairConfig(points=32, kept=24),
-        test_pairs=PairConfig(points=32, kept=24),
-        train=TrainConfig(steps=2, batch=2, validate_every=1, validation_pairs=2),
-        **{name: SMALL[name]},
-    )
+    config = short_training(name)
     train(config, tmp_path)
     variables, saved = load_checkpoint(tmp_path)
     assert saved == config
@@ -42,14 +35,7 @@ def test_two_steps_a_checkpoint_and_a_method(name, tmp_path):
 
 
 def test_weights_are_released_without_what_only_the_training_uses(tmp_path):
-    config = Config(
-        network="fmr",
-        fmr=SMALL["fmr"],
-        data=DataConfig(name="shapes", train_shapes=4, test_shapes=2),
-        pairs=PairConfig(points=32, kept=24),
-        test_pairs=PairConfig(points=32, kept=24),
-        train=TrainConfig(steps=1, batch=1, validate_every=1, validation_pairs=1),
-    )
+    config = short_training("fmr")
     trained = train(config, tmp_path / "run")
     place = release("own", tmp_path / "run", "command", directory=tmp_path).with_suffix("")
     released, _ = load_pretrained(str(place))
