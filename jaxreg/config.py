@@ -116,6 +116,8 @@ class IDAMConfig:
     """Neighbours of a point in its graph; the point itself is the first."""
     channels: tuple[int, ...] = (64, 64, 64, 64, 64)
     """Widths of the layers of the graph network; the last is that of the features."""
+    significance: tuple[int, ...] = (64, 32)
+    """Widths of the layers that tell the significance of a point, before the last."""
     hidden: int = 32
     """Width of the similarity and weight networks."""
     kept_one_in: int = 6

@@ -16,7 +16,7 @@ from jaxreg.batching import map_pairs
 from jaxreg.config import Config, ModelConfig
 from jaxreg.evaluation import baselines
 from jaxreg.network.model import Variables
-from jaxreg.peers import by_name, cemnet, dcp
+from jaxreg.peers import by_name, cemnet, dcp, fmr, idam, rpmnet
 from jaxreg.peers.rienet import load_rienet
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
@@ -46,6 +46,9 @@ _LOADERS: dict[str, Callable[[str], tuple[Variables, Config]]] = {
     "rienet": load_rienet,
     "dcp": dcp.load_weights,
     "cemnet": cemnet.load_weights,
+    "idam": idam.load_weights,
+    "rpmnet": rpmnet.load_weights,
+    "fmr": fmr.load_weights,
     "checkpoint": load_checkpoint,
 }
 
@@ -78,7 +81,7 @@ def choose(name: str, *, model: ModelConfig | None = None) -> Method:
     `identity` does nothing. From this library: `icp` (point to point, from where the clouds are),
     `register` (with all its defaults), `register_global`, and `register_global_learned` (the same
     with its released features). Trained networks: released weights, an NPZ file of the state dict
-    of RIENet, DCP or CEMNet, the best checkpoint of a run; if `model` is given, its
+    of RIENet, DCP, CEMNet, IDAM, RPM-Net or FMR, the best checkpoint of a run; if `model` is given, its
     `AFTER_TRAINING` fields replace those of the training. The rest are other people's
     (`jaxreg.evaluation.baselines`), optionally with the spacing of the points, as in
     `open3d_fgr@0.02`.
@@ -107,7 +110,7 @@ def choose(name: str, *, model: ModelConfig | None = None) -> Method:
 
 
 def load_network_of(name: str) -> tuple[Variables, Config]:
-    """Variables and configuration of `weights:NAME`, `rienet:FILE` (`dcp`, `cemnet`), `checkpoint:DIR`.
+    """Variables and configuration of `weights:NAME`, `checkpoint:DIR`, or `rienet:FILE` and the like.
 
     Raises:
       ValueError: there are no such weights, file or checkpoint.

@@ -38,6 +38,8 @@ def features(evidence: Evidence) -> Evidence:
         distance=jnp.log(evidence.distance),
         rough_distance=jnp.log(evidence.rough_distance),
         held=jnp.log10(jnp.maximum(evidence.held, 1e-6)),
+        # Half of the points are proof; of a grid, which coincides with itself, more is chance.
+        same=jnp.minimum(evidence.same, 0.5),
     )
 
 

@@ -24,7 +24,6 @@ from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import nearest_in, squared_distances
 from jaxreg.geometry.numerics import leading_max, safe_norm, safe_sqrt
 from jaxreg.geometry.procrustes import weighted_procrustes
-from jaxreg.io.arrays import read_arrays
 from jaxreg.network.features import DGCNN, BatchNorm
 from jaxreg.network.matching import feature_distance
 from jaxreg.network.model import Variables
@@ -397,14 +396,16 @@ def load_weights(path: str | Path) -> tuple[Variables, Config]:
     """Load CEMNet's published weights, an ``.npz`` of its state dict; PyTorch is not needed.
 
     Raises:
-      ValueError: the file is missing or not an ``.npz``, or it lacks an array of the network.
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
     """
-    arrays = read_arrays(path, remedy="give the .npz of CEMNet's state dict")
-    root = "coarse_policy"
-    try:
+
+    def read(arrays: state_dict.Arrays) -> tuple[Variables, CEMNetConfig]:
+        root = "coarse_policy"
         features = state_dict.dgcnn(arrays, f"{root}.emb_nn.", layers=5)
         layers = [(f"{root}.nn.{i}", f"{root}.nn.{i + 1}") for i in (0, 3)]
         sampling = state_dict.dense_and_norm(arrays, layers, last=f"{root}.nn.6")
-    except KeyError as error:
-        raise ValueError(f"{path} has no array {error}: give CEMNet's whole state dict.") from None
-    return state_dict.joined({"features": features, "sampling": sampling}), Config(network="cemnet")
+        return state_dict.joined({"features": features, "sampling": sampling}), CEMNetConfig()
+
+    variables, config = state_dict.load(path, "CEMNet", read, init_variables)
+    return variables, Config(network="cemnet", cemnet=config)

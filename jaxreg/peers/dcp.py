@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxreg.config import Config, DCPConfig
 from jaxreg.geometry.procrustes import weighted_procrustes
-from jaxreg.io.arrays import read_arrays
 from jaxreg.network.features import DGCNN
 from jaxreg.network.model import Variables
 from jaxreg.peers import pair, state_dict
@@ -90,11 +89,13 @@ def load_weights(path: str | Path) -> tuple[Variables, Config]:
     """Load DCP v1's published weights, an ``.npz`` of its state dict; PyTorch is not needed.
 
     Raises:
-      ValueError: the file is missing or not an ``.npz``, or it lacks an array of the network.
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
     """
-    arrays = read_arrays(path, remedy="give the .npz of DCP's state dict")
-    try:
+
+    def read(arrays: state_dict.Arrays) -> tuple[Variables, DCPConfig]:
         features = state_dict.dgcnn(arrays, "emb_nn.", layers=5)
-    except KeyError as error:
-        raise ValueError(f"{path} has no array {error}: give DCP's whole state dict.") from None
-    return state_dict.joined({"features": features}), Config(network="dcp")
+        return state_dict.joined({"features": features}), DCPConfig()
+
+    variables, config = state_dict.load(path, "DCP", read, init_variables)
+    return variables, Config(network="dcp", dcp=config)

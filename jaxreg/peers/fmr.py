@@ -12,6 +12,7 @@ authors train with twists up to 0.8). Clouds need about the size of those it was
 decoder makes a fixed number of points, whatever the number of the cloud's.
 """
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -256,3 +257,26 @@ def loss(
     gap = rigid.to_matrix(rigid.compose(found, rigid.inverse(truth)))
     pose = jnp.sum((gap - jnp.eye(4, dtype=gap.dtype)) ** 2)
     return total + pose, {"chamfer": total, "pose": pose}, variables
+
+
+def load_weights(path: str | Path) -> tuple[Variables, Config]:
+    """Load weights of the authors' program, an ``.npz`` of its state dict; PyTorch is not needed.
+
+    The decoder, which only the training needs, is left out: its layers are of another kind. Widths
+    are those of the arrays, the rest of the configuration is the default.
+
+    Raises:
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
+    """
+    variables, config = state_dict.load(path, "FMR", _read_state_dict, init_variables)
+    return variables, Config(network="fmr", fmr=config)
+
+
+def _read_state_dict(arrays: state_dict.Arrays) -> tuple[Variables, FMRConfig]:
+    names = [("encoder.h1", i) for i in (0, 3)] + [("encoder.h2", i) for i in (0, 3, 6)]
+    layers = [(f"{part}.{i}", f"{part}.{i + 1}") for part, i in names]
+    variables = state_dict.joined({"encoder": state_dict.dense_and_norm(arrays, layers)})
+    variables["params"]["steps"] = jnp.asarray(arrays["dt"]).reshape(-1)
+    kernels = (variables["params"]["encoder"][f"Dense_{i}"]["kernel"] for i in range(len(layers)))
+    return variables, FMRConfig(channels=tuple(kernel.shape[1] for kernel in kernels))

@@ -6,6 +6,7 @@ of kept points, so that a rough pose helps to find the next one. Clouds may over
 features are not invariant to rotation, and it was made for rotations up to 45 degrees.
 """
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -22,11 +23,12 @@ from jaxreg.geometry.procrustes import special_procrustes
 from jaxreg.network.features import BatchNorm
 from jaxreg.network.model import Variables
 from jaxreg.network.run import run_network
-from jaxreg.peers import pair
+from jaxreg.peers import pair, state_dict
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
 _LARGEST_SCORE = 20.0
 _SMALLEST_LOG = -30.0
+_FAR_BELOW = -1e30
 
 
 class Kept(NamedTuple):
@@ -51,6 +53,22 @@ class Step(NamedTuple):
     weights: Float[Array, "k"]
 
 
+class _Block(nn.Module):
+    """Layers of one point or pair alone; all but the last have a BatchNorm and a ReLU."""
+
+    widths: tuple[int, ...]
+    bn_momentum: float
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "*points c"], mask: Bool[Array, "*#points"], *, train: bool
+    ) -> Float[Array, "*points d"]:
+        for width in self.widths[:-1]:
+            x = nn.Dense(width, use_bias=False)(x)
+            x = nn.relu(BatchNorm(self.bn_momentum)(x, mask, train=train))
+        return nn.Dense(self.widths[-1])(x)
+
+
 class _GraphNetwork(nn.Module):
     """Features of every point: layers over the differences to its neighbours in the cloud."""
 
@@ -67,22 +85,15 @@ class _GraphNetwork(nn.Module):
         train: bool,
     ) -> Float[Array, "n c"]:
         x = points
-        for width in self.channels:
+        for i, width in enumerate(self.channels):
             # K first: the maximum over it is then an elementwise maximum of contiguous blocks.
-            edges = nn.Dense(width, use_bias=False)(x[neighbors.T] - x[None])
-            edges = nn.relu(BatchNorm(self.bn_momentum)(edges, mask[None, :], train=train))
-            x = jnp.where(mask[:, None], nn.Dense(width)(leading_max(nn.Dense(width)(edges))), 0)
+            edges = x[neighbors.T] - x[None]
+            edges = _Block((width, width), self.bn_momentum, name=f"edges_{i}")(
+                edges, mask[None, :], train=train
+            )
+            x = nn.Dense(width, name=f"points_{i}")(leading_max(edges))
+            x = jnp.where(mask[:, None], x, 0)
         return x
-
-
-class _SignificanceNetwork(nn.Module):
-    """How much a point is worth keeping: what its scores' negative entropy is expected to be."""
-
-    @nn.compact
-    def __call__(self, features: Float[Array, "n c"]) -> Float[Array, "n"]:
-        x = nn.relu(nn.Dense(features.shape[1])(features))
-        x = nn.relu(nn.Dense(max(features.shape[1] // 2, 1))(x))
-        return nn.Dense(1)(x)[:, 0]
 
 
 class _SimilarityNetwork(nn.Module):
@@ -97,15 +108,17 @@ class _SimilarityNetwork(nn.Module):
     ) -> tuple[Float[Array, "k l"], Float[Array, "k"]]:
         mask = source.cloud.mask[:, None] & reference.cloud.mask[None, :]
         x = jnp.where(mask[..., None], distance_augmented(source, reference), 0)
-        for _ in range(2):
-            x = nn.Dense(self.hidden)(x)
-            x = nn.relu(BatchNorm(self.bn_momentum)(x, mask, train=train))
-        score = nn.relu(BatchNorm(self.bn_momentum)(nn.Dense(self.hidden)(x), mask, train=train))
-        score = jnp.clip(nn.Dense(1)(score)[..., 0], -_LARGEST_SCORE, _LARGEST_SCORE)
-        # What passed a ReLU is not negative: zero leaves the maximum as it is.
-        pooled = leading_max(jnp.swapaxes(jnp.where(mask[..., None], x, 0), 0, 1))
-        validity = nn.Dense(1)(nn.relu(nn.Dense(self.hidden)(pooled)))
-        return score, nn.sigmoid(validity[:, 0])
+
+        def block(name: str, width: int, x, mask):
+            layers = _Block((self.hidden, width), self.bn_momentum, name=name)
+            return layers(x, mask, train=train)
+
+        x = block("pairs", self.hidden, x, mask)
+        score = block("scores", 1, x, mask)[..., 0]
+        pooled = leading_max(jnp.swapaxes(jnp.where(mask[..., None], x, _FAR_BELOW), 0, 1))
+        rows = jnp.any(mask, axis=1)
+        validity = block("validity", 1, jnp.where(rows[:, None], pooled, 0), rows)[:, 0]
+        return jnp.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE), nn.sigmoid(validity)
 
 
 def distance_augmented(source: Kept, reference: Kept) -> Float[Array, "k l d"]:
@@ -166,20 +179,22 @@ def init_variables(key: PRNGKeyArray, config: IDAMConfig) -> Variables:
     points, mask = jnp.ones((2, 3), jnp.float32), jnp.ones(2, bool)
     features = jnp.ones((2, config.channels[-1]), jnp.float32)
     kept = Kept(jnp.zeros(2, jnp.int32), PointCloud(points, mask), features)
-    inputs = {"graph": (points, jnp.zeros((2, 1), jnp.int32), mask), "significance": (features,)}
-    found: Variables = {"params": {}, "batch_stats": {}}
-    for i, (name, network) in enumerate(_networks(config).items()):
-        steered = {} if name == "significance" else {"train": False}
-        own = network.init(jax.random.fold_in(key, i), *inputs.get(name, (kept, kept)), **steered)
-        for kind, tree in own.items():
-            found[kind][name] = tree
-    return found
+    graph = points, jnp.zeros((2, 1), jnp.int32), mask
+    inputs = {"graph": graph, "significance": (features, mask)}
+    return state_dict.joined(
+        {
+            name: network.init(
+                jax.random.fold_in(key, i), *inputs.get(name, (kept, kept)), train=False
+            )
+            for i, (name, network) in enumerate(_networks(config).items())
+        }
+    )
 
 
 def _networks(config: IDAMConfig) -> dict[str, Any]:
     networks: dict[str, Any] = {
         "graph": _GraphNetwork(config.channels, config.bn_momentum),
-        "significance": _SignificanceNetwork(),
+        "significance": _Block((*config.significance, 1), config.bn_momentum),
     }
     for i in range(config.iterations):
         networks[f"similarity_{i}"] = _SimilarityNetwork(config.hidden, config.bn_momentum)
@@ -187,14 +202,19 @@ def _networks(config: IDAMConfig) -> dict[str, Any]:
 
 
 def _described(variables: Variables, cloud: PointCloud, config: IDAMConfig, *, train: bool):
-    """Features and significance of every point, and the variables with updated statistics."""
+    """Features and significance of every point, and the variables with updated statistics.
+
+    How much a point is worth keeping is what its scores' negative entropy is expected to be.
+    """
     networks = _networks(config)
     itself = jnp.arange(cloud.mask.shape[0], dtype=jnp.int32)[:, None]
     neighbors = jnp.concatenate([itself, knn(cloud.points, config.k - 1, cloud.mask)], axis=1)
     inputs = cloud.points, neighbors, cloud.mask
     features, variables = run_network(networks["graph"], "graph", variables, *inputs, train=train)
-    own = {"params": variables["params"]["significance"]}
-    return features, networks["significance"].apply(own, features), variables
+    significance, variables = run_network(
+        networks["significance"], "significance", variables, features, cloud.mask, train=train
+    )
+    return features, significance[:, 0], variables
 
 
 def hard_elimination(
@@ -239,16 +259,24 @@ def hybrid_elimination(validity: Float[Array, "k"], mask: Bool[Array, "k"]) -> F
 def centred_procrustes(
     source: PointCloud, copy: Float[Array, "k 3"], weights: Float[Array, "k"]
 ) -> RigidTransform:
-    """Weighted Procrustes about the *unweighted* centroids of valid points, as IDAM has it."""
-    share = source.mask.astype(copy.dtype)
-    share = (share / jnp.maximum(jnp.sum(share), 1))[None, :]
-    centroids = [jnp.matmul(share, x, precision=Precision.HIGHEST) for x in (source.points, copy)]
-    moving = (source.points - centroids[0]) * weights[:, None]
-    covariance = jnp.matmul(moving.T, copy - centroids[1], precision=Precision.HIGHEST)
+    """The pose of weighted correspondences as IDAM solves it.
+
+    The rotation is that of weighted Procrustes about the *unweighted* centroids of valid points; the
+    translation is the weighted mean of ``copy - R source``.
+    """
+
+    def means(share: Float[Array, "k"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        share = (share / jnp.where(jnp.sum(share) > 0, jnp.sum(share), 1))[None, :]
+        of_both = [jnp.matmul(share, x, precision=Precision.HIGHEST) for x in (source.points, copy)]
+        return of_both[0][0], of_both[1][0]
+
+    centroids = means(source.mask.astype(copy.dtype))
+    moving = (source.points - centroids[0][None, :]) * weights[:, None]
+    covariance = jnp.matmul(moving.T, copy - centroids[1][None, :], precision=Precision.HIGHEST)
     rotation = special_procrustes(covariance)
-    turned = jnp.matmul(rotation, centroids[0][0], precision=Precision.HIGHEST)
-    shift = jnp.where(jnp.any(source.mask), centroids[1][0] - turned, 0)
-    return RigidTransform(rotation, shift)
+    of_source, of_copy = means(jnp.where(source.mask, weights, 0))
+    turned = jnp.matmul(rotation, of_source, precision=Precision.HIGHEST)
+    return RigidTransform(rotation, of_copy - turned)
 
 
 def loss(
@@ -325,3 +353,49 @@ def _log_softmax(scores: Float[Array, "k l"], valid: Bool[Array, "l"], *, axis: 
     mask = valid[None, :] if axis == 1 else valid[:, None]
     logs = jax.nn.log_softmax(jnp.where(mask, scores, -_LARGEST_SCORE * 10), axis=axis)
     return jnp.maximum(logs, _SMALLEST_LOG)
+
+
+def load_weights(path: str | Path) -> tuple[Variables, Config]:
+    """Load weights of the authors' program, an ``.npz`` of its state dict; PyTorch is not needed.
+
+    Those of its graph network; with FPFH features it has none. Widths and the number of steps are
+    those of the arrays, the rest of the configuration is the default.
+
+    Raises:
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
+    """
+    variables, config = state_dict.load(path, "IDAM", _read_state_dict, init_variables)
+    return variables, Config(network="idam", idam=config)
+
+
+def _read_state_dict(arrays: state_dict.Arrays) -> tuple[Variables, IDAMConfig]:
+    def block(root: str) -> Variables:
+        last = state_dict.count(arrays, f"{root}.conv.") - 1
+        layers = [(f"{root}.conv.{i}.conv", f"{root}.conv.{i}.bn") for i in range(last)]
+        return state_dict.dense_and_norm(arrays, layers, last=f"{root}.conv.{last}")
+
+    depth, edges, points = state_dict.count(arrays, "emb_nn.propogate", first=1), {}, {}
+    for i in range(depth):
+        root = f"emb_nn.propogate{i + 1}"  # They are spelt so.
+        edges[f"edges_{i}"] = block(f"{root}.conv2d")
+        points[f"points_{i}"] = state_dict.dense(arrays, f"{root}.conv1d.conv.0")
+    graph = state_dict.joined(edges)
+    graph["params"] |= points
+    significance = block("significance_fc")
+    networks = {"graph": graph, "significance": significance}
+    steps = state_dict.count(arrays, "sim_mat_conv1.")
+    parts = {"pairs": "sim_mat_conv1", "scores": "sim_mat_conv2", "validity": "weight_fc"}
+    for i in range(steps):
+        networks[f"similarity_{i}"] = state_dict.joined(
+            {ours: block(f"{theirs}.{i}") for ours, theirs in parts.items()}
+        )
+    hidden = len(significance["batch_stats"])
+    return state_dict.joined(networks), IDAMConfig(
+        channels=tuple(points[f"points_{i}"]["kernel"].shape[1] for i in range(depth)),
+        significance=tuple(
+            significance["params"][f"Dense_{i}"]["kernel"].shape[1] for i in range(hidden)
+        ),
+        hidden=networks["similarity_0"]["params"]["pairs"]["Dense_0"]["kernel"].shape[1],
+        iterations=steps,
+    )

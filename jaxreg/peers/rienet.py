@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg.config import Config, LossConfig, ModelConfig
-from jaxreg.io.arrays import read_arrays
-from jaxreg.network.model import Variables
+from jaxreg.network.model import Variables, init_variables
 from jaxreg.peers import state_dict
 
 _MODEL = ModelConfig(
@@ -38,15 +37,16 @@ def load_rienet(path: str | Path) -> tuple[Variables, Config]:
     """Load RIENet's published weights for ModelNet40: their variables and their configuration.
 
     Raises:
-      ValueError: the file is missing or not an ``.npz``, or it lacks an array of the network.
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
     """
-    arrays = read_arrays(path, remedy="give the .npz of RIENet's state dict")
-    try:
+
+    def read(arrays: state_dict.Arrays) -> tuple[Variables, ModelConfig]:
         features = state_dict.dgcnn(arrays, "emb_nn.model.", layers=5)
-        networks = {"features": features, "inliers": _inliers(arrays)}
-    except KeyError as error:
-        raise ValueError(f"{path} has no array {error}: give RIENet's whole state dict.") from None
-    return state_dict.joined(networks), Config(model=_MODEL, loss=_LOSS)
+        return state_dict.joined({"features": features, "inliers": _inliers(arrays)}), _MODEL
+
+    variables, config = state_dict.load(path, "RIENet", read, init_variables)
+    return variables, Config(model=config, loss=_LOSS)
 
 
 def _inliers(arrays: Mapping[str, np.ndarray]) -> Variables:

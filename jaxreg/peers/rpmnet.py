@@ -10,6 +10,7 @@ the sign may differ between two clouds, and with it three of the ten channels of
 """
 
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -26,7 +27,7 @@ from jaxreg.geometry.numerics import included_angle, leading_max, safe_norm
 from jaxreg.geometry.procrustes import weighted_procrustes
 from jaxreg.network.matching import squared_feature_distance
 from jaxreg.network.model import Variables
-from jaxreg.peers import pair
+from jaxreg.peers import pair, state_dict
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
 _FAR = 1e30
@@ -315,3 +316,44 @@ def loss(
     share = _DISCOUNT ** later.astype(error.dtype)
     terms = {"pose_error": jnp.sum(share * error), "missing": jnp.sum(share * missing)}
     return terms["pose_error"] + config.inliers * terms["missing"], terms, variables
+
+
+def load_weights(path: str | Path) -> tuple[Variables, Config]:
+    """Load weights of the authors' program, an ``.npz`` of its state dict; PyTorch is not needed.
+
+    Widths are those of the arrays, the rest of the configuration is the default. Their clouds came
+    with normals of the mesh; ours are made of the points.
+
+    Raises:
+      ValueError: the file is missing or not an ``.npz``, or an array of the network is missing or has
+        another shape.
+    """
+    variables, config = state_dict.load(path, "RPM-Net", _read_state_dict, init_variables)
+    return variables, Config(network="rpmnet", rpmnet=config)
+
+
+def _read_state_dict(arrays: state_dict.Arrays) -> tuple[Variables, RPMNetConfig]:
+    def pointnet(root: str, before: int, after: int) -> Variables:
+        """Layers before and after the pooling: each a linear map, its GroupNorm and a ReLU."""
+        found: Variables = {}
+        names = [f"{root}.prepool.{3 * i}" for i in range(before)]
+        names += [f"{root}.postpool.{3 * i}" for i in range(after)]
+        for i, name in enumerate(names):
+            found[f"Dense_{i}"] = state_dict.dense(arrays, name)
+            if i + 1 < len(names):  # The last layer is a linear map alone.
+                stem, _, number = name.rpartition(".")
+                norm = f"{stem}.{int(number) + 1}"
+                scale, bias = (jnp.asarray(arrays[f"{norm}.{x}"]) for x in ("weight", "bias"))
+                found[f"_GroupNorm_{i}"] = {"scale": scale, "bias": bias}
+        return found
+
+    parameters = pointnet("weights_net", before=5, after=3)
+    features = pointnet("feat_extractor", before=3, after=3)
+    variables = {
+        "params": {"parameters": parameters, "features": features},
+        "batch_stats": {},
+    }
+    return variables, RPMNetConfig(
+        width=features["Dense_5"]["kernel"].shape[1],
+        hidden=tuple(parameters[f"Dense_{i}"]["kernel"].shape[1] for i in range(7)),
+    )

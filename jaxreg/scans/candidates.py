@@ -30,6 +30,8 @@ _CLEAR, _HOPELESS = 1.0, 0.6
 """If the best score of the search is above the first, poses with less than this share of it are not
 looked at. On 66 pairs of four sensors the pose that the judge put first had the best score of the
 search wherever that was above 0.9."""
+_AS_MANY = 0.9
+"""Two poses under which so nearly as many points coincide are one as good as the other."""
 _COUNTS = (4, 16, 64)
 """Poses are judged in batches of these sizes, so that few programs are compiled."""
 
@@ -155,6 +157,36 @@ def judged(
     count = len(chosen)
     poses = RigidTransform(nearest_rotation(moved.rotation[:count]), moved.translation[:count])
     return ranked(poses, *clouds.judge(poses))
+
+
+def with_half_turns(
+    clouds: Clouds,
+    points: Float[np.ndarray, "n 3"],
+    pose: RigidTransform,
+    others: tuple[tuple[RigidTransform, float], ...],
+) -> tuple[tuple[RigidTransform, float], ...]:
+    """The other poses of a pair and their log odds, with those after half turns about principal axes.
+
+    Copies of an even grid agree to the last digit under these, too, and the pose that a search comes
+    upon first leaves it no reason to look for the others. `points` are all of the source, in the
+    frame: a part of them has other axes. Distinct poses, the best first.
+    """
+    centre = points.mean(axis=0)
+    axes = np.linalg.eigh(np.cov((points - centre).T))[1].T
+    turns = nearest_rotation(2 * axes[:, :, None] * axes[:, None, :] - np.eye(3))
+    shifts = (centre - turns @ centre) @ pose.rotation.T + pose.translation
+    turned = RigidTransform(
+        np.concatenate([pose.rotation[None], pose.rotation @ turns]),
+        np.concatenate([pose.translation[None], shifts]),
+    )
+    evidence, score = clouds.judge(turned)
+    # Where as many points coincide, the rest of the evidence is chance: the points lie on no surface.
+    score = np.where(evidence.same >= _AS_MANY * evidence.same[0], np.max(score), score)
+    found = list(zip(map(RigidTransform, *turned), score.tolist(), strict=True))
+    found = [(pose, np.inf), *others, *found[1:]]
+    stacked = RigidTransform(*map(np.stack, zip(*(one for one, _ in found), strict=True)))
+    distinct = _distinct(stacked, np.array([score for _, score in found]), len(found))
+    return tuple(found[i] for i in distinct[1:])
 
 
 def ranked(poses: RigidTransform, evidence: Evidence, score: Float[np.ndarray, "k"]) -> Judged:

@@ -44,6 +44,10 @@ _UNLIKE_SIZES = 2.0
 """Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
+_SOME_SAME = 0.05
+"""Share of points that coincide above which the clouds may be copies: two scans share hardly any."""
+_ROUNDING_DEG = 0.05
+"""A pose at the limit of the rotation is allowed, whatever its rounding."""
 _MORE = 200
 """Further iterations of the refinement for a pose that still moves."""
 
@@ -94,11 +98,15 @@ class Problem(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The chosen pose in the frame, the others with their log odds, and how likely it is right."""
+    """The chosen pose in the frame, the others with their log odds, and how likely it is right.
+
+    A pose that was `given` was not searched for, and has no rivals.
+    """
 
     pose: RigidTransform
     others: tuple[tuple[RigidTransform, float], ...]
     probability: float = 1.0
+    given: bool = False
 
 
 def registered(
@@ -115,7 +123,7 @@ def registered(
     problem = pose_problem(source, reference, config, known)
     if start is None:
         return finished(problem, searched(problem), least=least, thorough=thorough)
-    found = Found(frame.transform_in(problem.where, start), ())
+    found = Found(frame.transform_in(problem.where, start), (), given=True)
     return finished(problem, found, thorough=thorough)
 
 
@@ -138,19 +146,19 @@ def pose_problem(
 
 def searched(problem: Problem) -> Found:
     """The most plausible pose: by the first search, or where that leaves doubts by a wider one."""
-    config, most = problem.config, math.radians(problem.known.max_rotation_deg)
+    config = problem.config
     found = searched_and_judged(problem, config.search)
     if config.wide is not None and chances(found.score).max() < SURE:
         found = candidates.merged(found, searched_and_judged(problem, config.wide))
         if (nearer := closer(problem)) and chances(found.score).max() < SURE:
             found = candidates.merged(found, searched_and_judged(nearer, config.wide))
-    turned = np.radians(rotation_angle_deg(found.poses.rotation, np.eye(3)[None]))
+    turned = rotation_angle_deg(found.poses.rotation, np.eye(3)[None])
     # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
     # the others is at least an answer.
-    allowed = turned <= most + 1e-3
+    allowed = turned <= problem.known.max_rotation_deg + _ROUNDING_DEG
     allowed = allowed if allowed.any() else np.ones_like(allowed)
     best = int(
-        np.argmax(np.where(allowed, found.score - candidates.TURN_COST * turned / np.pi, -np.inf))
+        np.argmax(np.where(allowed, found.score - candidates.TURN_COST * turned / 180, -np.inf))
     )
     poses = [RigidTransform(*pose) for pose in zip(*found.poses, strict=True)]
     others = np.flatnonzero(allowed & (np.arange(len(poses)) != best))
@@ -334,7 +342,17 @@ def finished(
     cause = cause or verdict.in_a_volume(
         judged, source.fine.examined, problem.reference.fine.examined
     )
-    likelihood = chances(np.array([score[0], *(s for _, s in found.others)]))
+    others = found.others
+    if judged.same > _SOME_SAME and not found.given and problem.motions is None:
+        points = source.points * (source.radius / length)
+        others = candidates.with_half_turns(problem.clouds(), points, refined.transform, others)
+        most = problem.known.max_rotation_deg + _ROUNDING_DEG
+        others = tuple(
+            (other, odds)
+            for other, odds in others
+            if rotation_angle_deg(other.rotation, np.eye(3)) <= most
+        )
+    likelihood = chances(np.array([score[0], *(s for _, s in others)]))
     weak = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in weak_directions(problem.known.held(refined.uncertainty))
@@ -355,7 +373,7 @@ def finished(
         overlap=_overlap(problem, refined.transform),
         alternatives=tuple(
             Alternative(frame.transform_out(where, other), float(likely))
-            for (other, _), likely in zip(found.others, likelihood[1:], strict=True)
+            for (other, _), likely in zip(others, likelihood[1:], strict=True)
             if likely >= LISTED
         ),
         notes=closing.notes,

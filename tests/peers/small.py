@@ -23,7 +23,9 @@ SMALL = {
         k=K, channels=(3, 4), width=4, hidden=(4,), iterations=2, candidates=6, look_ahead=1,
         epsilon=1.0, stride=2, reach=4,
     ),
-    "idam": IDAMConfig(k=K, channels=(3, 4), hidden=4, kept_one_in=1, iterations=2),
+    "idam": IDAMConfig(
+        k=K, channels=(3, 4), significance=(4, 2), hidden=4, kept_one_in=1, iterations=2
+    ),
     "rpmnet": RPMNetConfig(
         radius=2.0, neighbors=4, width=4, hidden=(4, 8, 4, 4), k_normals=K, sinkhorn=2,
         iterations=2, train_iterations=2,

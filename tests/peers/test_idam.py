@@ -13,6 +13,13 @@ from tests.peers.small import SMALL, draw_variables
 pytestmark = pytest.mark.loose
 
 
+def block(variables, name, x):
+    """A linear map, BatchNorm and ReLU, and a linear map."""
+    params, statistics = (variables[kind][name] for kind in ("params", "batch_stats"))
+    x = oracles.batch_norm(params, statistics, "BatchNorm_0", oracles.dense(params["Dense_0"], x))
+    return oracles.dense(params["Dense_1"], np.maximum(x, 0))
+
+
 def test_hard_elimination_keeps_the_most_significant_of_the_valid_points(seed):
     score = np.random.default_rng(seed).normal(size=20)
     mask = np.arange(20) < 13
@@ -32,7 +39,7 @@ def test_hybrid_elimination_drops_what_is_below_the_lower_median(seed):
     assert np.count_nonzero(found) == 4
 
 
-def test_procrustes_turns_about_the_unweighted_centroids(seed):
+def test_procrustes_turns_about_unweighted_centroids_and_shifts_by_weighted_ones(seed):
     rng = np.random.default_rng(seed)
     source, copy, weights = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.uniform(size=7)
     cloud = PointCloud(jnp.asarray(source), jnp.ones(7, bool))
@@ -41,7 +48,7 @@ def test_procrustes_turns_about_the_unweighted_centroids(seed):
     u, _, vt = np.linalg.svd((x * weights[:, None]).T @ y)
     rotation = vt.T @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ u.T
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-9)
-    shift = copy.mean(axis=0) - rotation @ source.mean(axis=0)
+    shift = np.average(copy - source @ rotation.T, axis=0, weights=weights)
     np.testing.assert_allclose(found.translation, shift, atol=1e-9)
 
 
@@ -59,14 +66,6 @@ def test_similarity_and_validity_are_those_of_the_layers(seed):
     network = idam._networks(SMALL["idam"])["similarity_0"]
     own = {kind: tree["similarity_0"] for kind, tree in variables.items()}
     scores, validity = network.apply(own, *kept, train=False)
-    params, statistics = own["params"], own["batch_stats"]
-
-    def layer(i, x):
-        x = oracles.batch_norm(
-            params, statistics, f"BatchNorm_{i}", oracles.dense(params[f"Dense_{i}"], x)
-        )
-        return np.maximum(x, 0)
-
     for i in range(5):
         row = []
         for j in range(6):
@@ -74,15 +73,12 @@ def test_similarity_and_validity_are_those_of_the_layers(seed):
             features = [np.asarray(k.features)[r] for k, r in zip(kept, (i, j), strict=True)]
             distance = np.linalg.norm(p - q)
             pair = np.concatenate([*features, [distance], (p - q) / distance])
-            x = layer(1, layer(0, pair))
+            x = block(own, "pairs", pair)
             row.append(x)
-            score = np.clip(oracles.dense(params["Dense_3"], layer(2, x))[0], -20, 20)
+            score = np.clip(block(own, "scores", x)[0], -20, 20)
             np.testing.assert_allclose(scores[i, j], score, atol=1e-9)
-        pooled = np.max(row, axis=0)
-        # The outer linear map is made before the inner one that it is applied to.
-        hidden = np.maximum(oracles.dense(params["Dense_5"], pooled), 0)
-        value = 1 / (1 + np.exp(-oracles.dense(params["Dense_4"], hidden)[0]))
-        np.testing.assert_allclose(validity[i], value, atol=1e-9)
+        value = block(own, "validity", np.max(row, axis=0))[0]
+        np.testing.assert_allclose(validity[i], 1 / (1 + np.exp(-value)), atol=1e-9)
 
 
 def test_half_of_the_rows_have_a_partner_where_there_are_enough():
@@ -101,8 +97,6 @@ def test_features_are_those_of_the_layers(seed):
     run = jax.jit(lambda x: network.apply(own, x, near, jnp.ones(9, bool), train=False))
     x = points
     for i in range(2):
-        edges = oracles.dense(own["params"][f"Dense_{3 * i}"], x[near] - x[:, None])
-        normal = oracles.batch_norm(own["params"], own["batch_stats"], f"BatchNorm_{i}", edges)
-        lifted = oracles.dense(own["params"][f"Dense_{3 * i + 2}"], np.maximum(normal, 0))
-        x = oracles.dense(own["params"][f"Dense_{3 * i + 1}"], lifted.max(axis=1))
+        edges = block(own, f"edges_{i}", x[near] - x[:, None])
+        x = oracles.dense(own["params"][f"points_{i}"], edges.max(axis=1))
     np.testing.assert_allclose(run(points), x, atol=1e-8)

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from jaxreg.geometry import frame
 from jaxreg.judge.evidence import Evidence, read_evidence
 from jaxreg.judge.odds import log_odds
 from jaxreg.scans import candidates, prepare
@@ -85,6 +87,28 @@ def some(rng, count):
     poses = RigidTransform(turns, rng.uniform(-0.1, 0.1, (count, 3)))
     score = rng.normal(size=count)
     return poses, Evidence(*[10 * score + k for k in range(len(Evidence._fields))]), score
+
+
+def test_half_turns_lay_an_even_grid_on_itself(rng):
+    """The three half turns of a cuboid of points, from a pose that lays the source on the reference."""
+    grid = np.stack(np.meshgrid(*map(np.arange, (7.0, 9.0, 12.0))), axis=-1).reshape(-1, 3)
+    pose = random_pose(rng, angle=2.0, shift=5.0)
+    problem = problem_of(grid, grid @ pose.rotation.T + pose.translation)
+    start = frame.transform_in(problem.where, pose)
+    points = problem.source.points * (problem.source.radius / float(problem.where.length))
+    nudged = start._replace(translation=start.translation + 0.01)
+    others = (nudged, 3.0), (start._replace(translation=start.translation + 1), -50.0)
+    found = candidates.with_half_turns(problem.clouds(), points, start, others)
+    # The one that is hardly moved is the pose itself; the best come first.
+    assert len(found) == 4
+    assert found[-1] == others[1]
+    _, straight = problem.clouds().judge(jax.tree.map(lambda leaf: leaf[None], start))
+    for turned, score in found[:3]:
+        turned = frame.transform_out(problem.where, turned)
+        back = (grid @ turned.rotation.T + turned.translation - pose.translation) @ pose.rotation
+        assert cKDTree(grid).query(back)[0].max() < 1e-6
+        assert np.abs(back - grid).max() > 5
+        assert score == pytest.approx(straight[0], abs=2)
 
 
 def test_distinct_poses_are_the_best_of_those_that_are_one(rng):

@@ -358,6 +358,21 @@ def test_a_regular_grid_is_laid_on_the_grid(rng):
     assert {tuple(x) for x in np.round(back)} == {tuple(x) for x in grid}
 
 
+def test_a_copy_of_a_solid_grid_is_no_success():
+    """Four poses agree to the last digit; more points than are judged, so that by chance one wins."""
+    sizes = map(np.arange, (14.0, 17.0, 20.0))
+    grid = np.stack(np.meshgrid(*sizes, indexing="ij"), axis=-1).reshape(-1, 3)
+    for seed in (0, 7):
+        turned = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+        found = register(grid, moved(grid, turned, np.array([1.0, -2.0, 3.0])))
+        assert not found.success, seed
+        assert len(found.alternatives) >= 3, seed
+        rest = grid[~((grid[:, 0] > 7) & (grid[:, 1] > 8))]
+        found = register(rest, moved(rest, turned, np.array([1.0, -2.0, 3.0])))
+        assert found.success, seed
+        assert angle_deg(found.rotation, turned) < 0.1, seed
+
+
 @pytest.mark.parametrize(
     ("bad", "told"),
     [

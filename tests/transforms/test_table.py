@@ -27,7 +27,7 @@ HOST |= {
     "view.pictures.plot_pair",
 }
 HOST |= {"view.page.write_registration_page", "scans.prepare.prepare", "training.train"}
-HOST |= {"peers.dcp.load_weights", "peers.cemnet.load_weights"}
+HOST |= {f"peers.{name}.load_weights" for name in ("dcp", "cemnet", "idam", "rpmnet", "fmr")}
 HOST |= {"peers.rienet.load_rienet", "weights.checkpoint.load_checkpoint"}
 HOST |= {"data.procedural.shapes.sample_shape", "refine.config.RefineConfig"}
 HOST |= {"network.batch.register_batch", "exported.export_program", "exported.load_exported"}
