@@ -60,7 +60,8 @@ class Align:
     """The same by the times of the scans: a file with one number a scan (text or NPY, any unit), in the
     order of the scans above. Scans before and after a long pause are no neighbours."""
     initial: OptionalPath = None
-    """Start from these poses (the formats of --poses); scans without one are looked for."""
+    """Start from these poses, all in one frame (the formats of --poses; of a JSON with several groups
+    the first one's); scans without one are looked for."""
     viewpoint: Viewpoint = "unknown"
     """Where the scanner of each scan stood, as in `jaxreg register`: worth much where places look
     alike."""
@@ -180,7 +181,9 @@ def _write(
 
     def write_poses(path: Path) -> None:
         edges = summary.edges(alignment) if path.suffix.lower() == ".g2o" else None
-        io.write_poses(path, alignment.transformation, names=names, edges=edges)
+        io.write_poses(
+            path, alignment.transformation, names=names, edges=edges, groups=alignment.groups
+        )
 
     writers = (
         (command.poses, write_poses),

@@ -46,12 +46,15 @@ def write_poses(
     *,
     names: Sequence[str] = (),
     edges: Edges | None = None,
+    groups: Sequence[Sequence[int]] = (),
 ) -> None:
     """Write poses (scan to common frame) in the format of the suffix; NaN marks a scan without one.
 
-    `.json`: ``{"poses": {name: 4x4 or null}}``. `.txt`: four lines a scan below ``# name``. `.tum`:
-    number, translation and quaternion (x, y, z, w), scans without a pose left out. `.kitti`: the first
-    three rows in one line a scan, NaN where there is none. `.g2o`: vertices, and `edges`.
+    `.json`: ``{"poses": {name: 4x4 or null}}``, and ``"groups"``, lists of names, where there are
+    several `groups` (the numbers of their scans), each in a frame of its own. `.txt`: four lines a scan
+    below ``# name``. `.tum`: number, translation and quaternion (x, y, z, w), scans without a pose left
+    out. `.kitti`: the first three rows in one line a scan, NaN where there is none. `.g2o`: vertices,
+    and `edges`.
 
     Raises:
       ValueError: the suffix is none of these.
@@ -60,7 +63,7 @@ def write_poses(
     check_poses_output(path)
     names = list(names) or [str(k) for k in range(len(poses))]
     write: Callable[[], str] = {
-        ".json": lambda: _json_text(poses, names),
+        ".json": lambda: _json_text(poses, names, groups),
         ".txt": lambda: _matrix_text(poses, names),
         ".tum": lambda: _tum_text(poses),
         ".kitti": lambda: "".join(_row(pose[:3].ravel().tolist()) for pose in poses),
@@ -72,6 +75,7 @@ def write_poses(
 def read_poses(path: str | Path, names: Sequence[str] = ()) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Poses by name: of JSON and 4x4 text the names there, of other files the numbers of the scans.
 
+    Of a JSON file with several groups the poses of the first, since each has a frame of its own.
     With `names` (of the scans, in their order) the result has an entry for every scan that has a pose.
     In files with names it is found by its path, or by as much of its end as tells it from all others:
     the file name or the stem, and the folders before it. In files without names, or with none of
@@ -157,7 +161,10 @@ def _from_json(text: str) -> _Poses:
     content = json.loads(text)
     poses = content.get("poses", content) if isinstance(content, dict) else content
     items = poses.items() if isinstance(poses, dict) else enumerate(poses)
-    return {key: None if pose is None else _checked(pose) for key, pose in items}
+    found = {key: None if pose is None else _checked(pose) for key, pose in items}
+    groups = content.get("groups", []) if isinstance(content, dict) else []
+    elsewhere = {name for group in groups[1:] for name in group}
+    return {key: None if key in elsewhere else pose for key, pose in found.items()}
 
 
 def _from_text(text: str) -> _Poses:
@@ -332,12 +339,13 @@ def _row(values: Sequence[float]) -> str:
     return " ".join(repr(float(value)) for value in values) + "\n"
 
 
-def _json_text(poses: np.ndarray, names: list[str]) -> str:
+def _json_text(poses: np.ndarray, names: list[str], groups: Sequence[Sequence[int]]) -> str:
     known = {
         name: pose.tolist() if np.isfinite(pose).all() else None
         for name, pose in zip(names, poses, strict=True)
     }
-    return json.dumps({"poses": known}, indent=1) + "\n"
+    apart = {"groups": [[names[k] for k in group] for group in groups]} if len(groups) > 1 else {}
+    return json.dumps({"poses": known} | apart, indent=1) + "\n"
 
 
 def _matrix_text(poses: np.ndarray, names: list[str]) -> str:

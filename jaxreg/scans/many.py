@@ -158,9 +158,9 @@ def register_many(
     looked for; an `order` of numbers, one a scan, are the times at which the scans were taken (any
     unit): neighbours are then those in time, unless ten times the usual step lies between them.
     `initial` are poses to start from, one a scan (4x4, a `RigidTransform` or None; NaN is None), all in
-    one frame, or an earlier `Alignment` of one group. `viewpoints` say where the scanner of each scan
-    stood (3,), in the coordinates of the scan, None where unknown: see `jaxreg.prepare`. `joint`
-    refines all poses together at the end.
+    one frame, or an earlier `Alignment`, of which the first group counts. `viewpoints` say where the
+    scanner of each scan stood (3,), in the coordinates of the scan, None where unknown: see
+    `jaxreg.prepare`. `joint` refines all poses together at the end.
     With `work`, a folder, prepared scans and finished pairs are kept there, and a run with the same
     scans and settings goes on where the last one ended. Pairs run on `executor` (any of
     `concurrent.futures`, Dask's, Ray's or mpi4py's; `work` must then be a folder that its workers
@@ -232,7 +232,11 @@ def _checked_starts(
 ) -> list[np.ndarray | None]:
     if initial is None:
         return [None] * count
-    poses = initial.transformation if isinstance(initial, Alignment) else initial
+    if isinstance(initial, Alignment):
+        first = initial.groups[0] if initial.groups else ()
+        poses = [x if k in first else None for k, x in enumerate(initial.transformation)]
+    else:
+        poses = initial
     if len(poses) != count:
         raise ValueError(f"{len(poses)} initial poses for {count} scans: give one each, or None.")
     starts: list[np.ndarray | None] = []

@@ -172,6 +172,22 @@ def test_further_groups_have_numbers_where_nothing_is_in_the_way(rooms, tmp_path
     assert set_of(tmp_path / "all.2.ply") == {2, 3}
 
 
+def test_poses_of_groups_name_these_and_start_the_first_alone(
+    rooms, tmp_path, run, placed, monkeypatch
+):
+    placed(((0, 2), (1, 3)))
+    run("align", *rooms, "--poses", tmp_path / "p.json")
+    found, given = many.register_many, []
+
+    def listening(clouds, **options):
+        given.extend(options["initial"])
+        return found(clouds, **options)
+
+    monkeypatch.setattr(many, "register_many", listening)
+    run("align", *rooms, "--initial", tmp_path / "p.json")
+    assert [pose is not None for pose in given] == [True, False, True, False]
+
+
 def test_a_merged_cloud_that_is_not_written_is_told(rooms, tmp_path, run, placed):
     placed(())
     status, out, _ = run("align", *rooms, "-o", tmp_path / "all.ply")

@@ -59,6 +59,16 @@ def test_poses_without_names_are_those_of_the_scans_in_their_order(tmp_path):
         assert found == {"1.ply": 10, "2.ply": 20, "3.ply": 30}, path.name
 
 
+def test_of_several_groups_the_first_one_s_poses_are_in_one_frame(tmp_path):
+    path = tmp_path / "p.json"
+    write_poses(path, shifts(0, 1, 2, 3), names=list("abcd"), groups=[(0, 3), (1, 2)])
+    assert json.loads(path.read_text())["groups"] == [["a", "d"], ["b", "c"]]
+    assert lengths_of(read_poses(path)) == {"a": 0, "d": 3}
+    assert lengths_of(read_poses(path, ["c.ply", "d.ply"])) == {"d.ply": 3}
+    write_poses(path, shifts(0, 1), names=list("ab"), groups=[(0, 1)])
+    assert lengths_of(read_poses(path)) == {"a": 0, "b": 1}
+
+
 def test_a_block_without_a_pose_shifts_no_other(tmp_path):
     rows = shifts(np.nan, 20, 30).reshape(-1, 4)
     np.savetxt(tmp_path / "p.txt", rows)

@@ -193,6 +193,23 @@ def test_a_prepared_scan_is_the_same_after_it_was_stored(scans, tmp_path, seed):
         stored.load(tmp_path / "b.npz", NARROW)
 
 
+def test_an_earlier_alignment_starts_the_scans_of_its_first_group(scans, alignment, monkeypatch):
+    """Each group has a frame of its own."""
+    given = []
+
+    def from_starts(run, starts):
+        given.extend(starts)
+        return []
+
+    monkeypatch.setattr(many, "_from_starts", from_starts)
+    monkeypatch.setattr(many, "_first_pairs", lambda *_: [])
+    monkeypatch.setattr(many, "_wider", lambda *_: [])
+    earlier = dataclasses.replace(alignment, groups=((0, 2, 3), (1, 4)))
+    register_many(scans[0], initial=earlier, config=NARROW)
+    assert [start is not None for start in given] == [True, False, True, True, False]
+    np.testing.assert_allclose(given[2], alignment.transformation[2])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
