@@ -17,7 +17,7 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import chances
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, dense, diagnosis, free_space, prepare, stable, verdict
+from jaxreg.scans import candidates, dense, diagnosis, free_space, halves, prepare, stable, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
@@ -335,6 +335,8 @@ def finished(
     if closing.settled is not None:
         last, covariance = closing.settled.pose, closing.settled.covariance
         refined = refined._replace(transform=last._replace(translation=last.translation / length))
+    if thorough and found.probability >= least:
+        covariance = _with_sampling(problem, refined.transform, covariance)
     evidence, score = problem.clouds().judge(
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
     )
@@ -378,6 +380,27 @@ def finished(
         ),
         notes=closing.notes,
     )
+
+
+def _with_sampling(
+    problem: Problem, pose: RigidTransform, covariance: Float[np.ndarray, "6 6"]
+) -> Float[np.ndarray, "6 6"]:
+    """The covariance of a pose, wider where halves of small clouds tell that sampling moves it."""
+    sides, config = (problem.source, problem.reference), problem.config
+    levels = (sides[0].fine, sides[1].fine)
+    small = max(len(level.points) for level in levels) <= halves.MOST
+    if config.refine is None or not (small and config.halvings and np.isfinite(covariance).all()):
+        return covariance
+    length = float(problem.where.length)
+    found = halves.differences(
+        levels, (sides[0].radius / length, sides[1].radius / length), pose,
+        halvings=config.halvings, distance=problem.reach(), config=config.refine,
+        motions=problem.motions,
+    )  # fmt: skip
+    units = np.repeat([1.0, length], 3)
+    units = np.outer(units, units)
+    free = 6 if problem.motions is None else problem.motions.shape[1]
+    return halves.widened(covariance / units, found, free) * units
 
 
 def _reason(
