@@ -7,17 +7,18 @@ them the pose differs. Only where it differs by more than the covariance says is
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxreg.refine.config import RefineConfig
-from jaxreg.refine.kdtree import IndexedCloud, iterate
+from jaxreg.refine.kdtree import iterate
 from jaxreg.refine.robust import Weighting
 from jaxreg.scans.prepare import Level
 from jaxreg.types import RigidTransform
 
-MOST = 1024
-"""Of larger clouds the planes are known well enough: sampling moves a pose by less than noise does."""
+LEAST, MOST = 64, 1024
+"""Points of a cloud that is halved. Of larger ones the planes are known well enough: sampling moves a
+pose by less than noise does. Halves of smaller ones have no planes."""
 _SHARE = 0.3
 """Of the spread of halves that is taken for that of the whole: halves are sampled more coarsely, and
 differ by more than their number alone would make them."""
@@ -41,26 +42,20 @@ def differences(
     the largest between corresponding points of whole clouds. The same clouds give the same halves.
     """
     weighting = Weighting(config.kernel, None, float(distance), config.trim)
-    found, rng = [], np.random.default_rng(0)
-    for _ in range(halvings):
-        orders = [rng.permutation(len(level.points)) for level in levels]
-        poses = []
-        for first in (0, 1):
-            source, reference = (
-                _part(level, np.sort(order[first::2]), scale)
-                for level, order, scale in zip(levels, orders, scales, strict=True)
-            )
-            half, *_ = iterate(pose, source, reference, weighting, config=config, motions=motions)
-            poses.append(half)
-        turn = poses[0].rotation @ poses[1].rotation.T
-        shift = poses[0].translation - turn @ poses[1].translation
+    found = []
+    for number in range(halvings):
+        sources, references = (
+            [half._replace(scale=scale) for half in level.halved(number)]
+            for level, scale in zip(levels, scales, strict=True)
+        )
+        one, other = (
+            iterate(pose, source, reference, weighting, config=config, motions=motions)[0]
+            for source, reference in zip(sources, references, strict=True)
+        )
+        turn = one.rotation @ other.rotation.T
+        shift = one.translation - turn @ other.translation
         found.append(np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift]) / 2)
     return np.array(found)
-
-
-def _part(level: Level, rows: Int[np.ndarray, "p"], scale: float) -> IndexedCloud:
-    normals = None if level.normals is None else level.normals[rows]
-    return Level(level.points[rows], normals, level.k).index._replace(scale=scale)
 
 
 def widened(

@@ -388,7 +388,7 @@ def _with_sampling(
     """The covariance of a pose, wider where halves of small clouds tell that sampling moves it."""
     sides, config = (problem.source, problem.reference), problem.config
     levels = (sides[0].fine, sides[1].fine)
-    small = max(len(level.points) for level in levels) <= halves.MOST
+    small = all(halves.LEAST <= len(level.points) <= halves.MOST for level in levels)
     if config.refine is None or not (small and config.halvings and np.isfinite(covariance).all()):
         return covariance
     length = float(problem.where.length)
