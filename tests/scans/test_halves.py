@@ -7,9 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.data.procedural.surfaces import box, sample, union
+from jaxreg.refine.config import RefineConfig
 from jaxreg.scans import halves
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.pair import register
+from jaxreg.scans.prepare import Level
+from jaxreg.scans.result import matrix_of
+from jaxreg.types import RigidTransform
 from tests.scenes import shape
 
 NONE = RegisterConfig(halvings=0, wide=None)
@@ -41,6 +45,35 @@ def test_the_covariance_grows_with_what_it_did_not_say(seed):
     more = 0.3 * (1 - 1.5 / ratio) / 2
     expected = (1 + more * ratio) * np.eye(6) + more * 900 * np.outer(along, along)
     np.testing.assert_allclose(wider, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_differences_are_half_of_the_motion_between_the_poses_of_two_halves(seed, monkeypatch):
+    """Matrices: A B^-1, whatever the refinement finds; each point is in one of two halves."""
+    rng = np.random.default_rng(seed)
+    turns = Rotation.random(4, rng=rng).as_matrix()
+    poses = [RigidTransform(turn, rng.normal(size=3)) for turn in turns]
+    levels = tuple(Level(rng.normal(size=(count, 3)), None, 8) for count in (90, 71))
+    given = []
+
+    def iterate(pose, source, reference, *_, **options):
+        given.append((source, reference))
+        return (poses[len(given) - 1],)
+
+    monkeypatch.setattr(halves, "iterate", iterate)
+    options = {"halvings": 2, "distance": 1.0, "config": RefineConfig(), "motions": None}
+    found = halves.differences(levels, (2.0, 3.0), poses[0], **options)
+    for k, motion in enumerate(found):
+        one, other = (matrix_of(pose) for pose in poses[2 * k : 2 * k + 2])
+        between = one @ np.linalg.inv(other)
+        turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
+        np.testing.assert_allclose(2 * motion, [*turn, *between[:3, 3]], atol=1e-9)
+        for side, level in enumerate(levels):
+            parts = [given[2 * k + half][side] for half in (0, 1)]
+            assert abs(len(parts[0].points) - len(parts[1].points)) <= 1
+            both = np.concatenate([part.points for part in parts])
+            np.testing.assert_array_equal(np.sort(both, axis=0), np.sort(level.points, axis=0))
+            assert {part.scale for part in parts} == {(2.0, 3.0)[side]}
+    assert not np.array_equal(given[0][0].points, given[2][0].points)
 
 
 def plate():
