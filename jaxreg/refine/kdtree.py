@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxreg._xla import from_host
@@ -175,11 +175,12 @@ def iterate_all(
     config: RefineConfig,
     step: int = 1,
     motions: Float[np.ndarray, "6 f"] | None = None,
+    counted: Bool[np.ndarray, "k n"] | None = None,
 ) -> RigidTransform:
     """All iterations of `config` for many poses (leading axis, numpy) at once.
 
     One search of the tree and one program for all of them, which takes a fraction of the time that
-    they would take in turn.
+    they would take in turn. `counted` says which points of the source take part, for every pose.
     """
     settings = dataclasses.replace(config, max_correspondence_distance=math.inf)
     for width in widenings(config.iterations, config.kernel_annealing, np.dtype("float32")):
@@ -187,6 +188,9 @@ def iterate_all(
             poses, source, reference, step, both_directions=config.both_directions,
             within=_within(weighting),
         )  # fmt: skip
+        if counted is not None:
+            part = np.take_along_axis(counted, pairs.source_index, axis=1)
+            pairs = pairs._replace(mask=pairs.mask & part)
         poses = _steps(
             poses, source[3:], reference[3:], pairs, weighting.kernel_scale,
             weighting.max_correspondence_distance, float(width), motions, config=settings,

@@ -22,9 +22,9 @@ TURN_COST = 0.2
 symmetric shape) the one that turns least is taken."""
 APART_DEG, APART = 6.0, 0.1
 """Poses nearer to each other than this (in the unit of the frame) are one and the same."""
-_REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)
+REFINE = RefineConfig(iterations=5, kernel_annealing=4.0, both_directions=True, k=16, epsilon=0.01)
 """How a pose is refined before it is judged: surfaces a spacing apart say little."""
-_STEP = 2
+STEP = 2
 """Every second point looks for a partner then."""
 _CLEAR, _HOPELESS = 1.0, 0.6
 """If the best score of the search is above the first, poses with less than this share of it are not
@@ -58,7 +58,7 @@ class Clouds(NamedTuple):
         Free space is in the log odds, not in the evidence.
         """
         count, free = len(poses.rotation), self.sides.log_odds(poses)
-        poses = _padded(poses)
+        poses = padded(poses)
         spacings = (
             float(cloud.spacing) * index.scale
             for cloud, index in zip(self.examined, self[:2], strict=True)
@@ -85,7 +85,7 @@ def read(
 ) -> Evidence:
     """The evidence for poses whose nearest points are known: see `jaxreg.judge.read_evidence`."""
     count = len(poses.rotation)
-    poses = _padded(poses)
+    poses = padded(poses)
     there, back = (
         np.pad(
             np.concatenate([index, index[-1:].repeat(len(poses.rotation) - count, 0)]),
@@ -105,7 +105,7 @@ def odds(evidence: Evidence) -> Float[np.ndarray, "k"]:
 _log_odds = from_host(jax.jit(log_odds))
 
 
-def _padded(poses: RigidTransform) -> RigidTransform:
+def padded(poses: RigidTransform) -> RigidTransform:
     """The poses, the last one repeated up to one of a few counts."""
     count = len(poses.rotation)
     size = next((size for size in _COUNTS if size >= count), count)
@@ -138,7 +138,7 @@ def judged(
 
     `distance` is the largest between corresponding points, in the unit of the frame.
     """
-    weighting = Weighting(_REFINE.kernel, None, distance, _REFINE.trim)
+    weighting = Weighting(REFINE.kernel, None, distance, REFINE.trim)
     if score.max() > _CLEAR:
         poses, score = jax.tree.map(
             lambda leaf: leaf[score > _HOPELESS * score.max()], (poses, score)
@@ -146,12 +146,12 @@ def judged(
     chosen = _distinct(poses, score, most)
     poses = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
     moved = iterate_all(
-        _padded(poses),
+        padded(poses),
         clouds.source,
         clouds.reference,
         weighting,
-        config=_REFINE,
-        step=_STEP,
+        config=REFINE,
+        step=STEP,
         motions=motions,
     )
     count = len(chosen)

@@ -1,61 +1,65 @@
-"""How far a pose moves with the sample of the surfaces: halves of both clouds, refined apart.
+"""How far a pose moves where only a half of the overlap decides: what residuals do not tell.
 
-The residuals of one sample tell how far each point lies off, not what this sample did to all planes
-at once: where a thin plate is sampled more coarsely than it is thick, the planes of a whole region
-lie between its sides. Two halves of the points are two samples of the same surfaces, and under
-them the pose differs. Only where it differs by more than the covariance says is that widened.
+Residuals say how far each point lies off a pose that has bent to all of them. They do not say what is
+wrong with whole regions: planes between the sides of a plate that is thinner than its points lie
+apart, a depth image that is warped, a scan that drifted. The two halves of an overlap are two
+pairs of scans of the same surfaces, and what is wrong with one is not wrong with the other: their
+poses differ. Where they differ by more than the covariance says, it is widened.
 """
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxreg.refine.config import RefineConfig
-from jaxreg.refine.kdtree import iterate
+from jaxreg.geometry.rigid import nearest_rotation
+from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
-from jaxreg.scans.prepare import Level
+from jaxreg.scans import candidates
 from jaxreg.types import RigidTransform
 
-LEAST, MOST = 64, 1024
-"""Points of a cloud that is halved. Of larger ones the planes are known well enough: sampling moves a
-pose by less than noise does. Halves of smaller ones have no planes."""
-_SHARE = 0.3
-"""Of the spread of halves that is taken for that of the whole: halves are sampled more coarsely, and
-differ by more than their number alone would make them."""
-_SAID = 1.5
+_LEAST = 64
+"""Points of an overlap that is halved."""
+_SHARE = 0.5
+"""Of the spread of the halves: each has half of the points and of the extent, so that its pose is
+less certain than that of the whole."""
+_SAID = 3.0
 """Halves that differ by no more than so many times what the covariance says do not widen it."""
 
 
 def differences(
-    levels: tuple[Level, Level],
-    scales: tuple[float, float],
+    source: IndexedCloud,
+    reference: IndexedCloud,
     pose: RigidTransform,
     *,
-    halvings: int,
     distance: float,
-    config: RefineConfig,
     motions: Float[np.ndarray, "6 f"] | None,
 ) -> Float[np.ndarray, "s 6"]:
-    """Half of the motions between the poses of two halves, about the origin of the frame.
+    """Half of the motions between the poses of the two halves of an overlap, about the origin.
 
-    Each is a rotation vector and a translation. `scales` place the levels in the frame; `distance` is
-    the largest between corresponding points of whole clouds. The same clouds give the same halves.
+    Each is a rotation vector and a translation in the frame of both clouds. The overlap, the points of
+    the source within `distance` of the reference, is halved across its longest axis and across the
+    next one. There is none if it has too few points.
     """
-    weighting = Weighting(config.kernel, None, float(distance), config.trim)
-    found = []
-    for number in range(halvings):
-        sources, references = (
-            [half._replace(scale=scale) for half in level.halved(number)]
-            for level, scale in zip(levels, scales, strict=True)
-        )
-        one, other = (
-            iterate(pose, source, reference, weighting, config=config, motions=motions)[0]
-            for source, reference in zip(sources, references, strict=True)
-        )
-        turn = one.rotation @ other.rotation.T
-        shift = one.translation - turn @ other.translation
-        found.append(np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift]) / 2)
-    return np.array(found)
+    moved = source.moved_by(pose)
+    near = np.isfinite(reference.nearest(moved, within=distance)[0])
+    if near.sum() < 2 * _LEAST:
+        return np.zeros((0, 6))
+    centred = moved - moved[near].mean(axis=0)
+    axes = np.linalg.eigh(np.cov(centred[near].T))[1].T[:0:-1]
+    along = axes @ centred.T
+    first = along > np.median(along[:, near], axis=1)[:, None]
+    counted = np.concatenate([first, ~first])
+    poses = RigidTransform(*(np.repeat(part[None], len(counted), 0) for part in pose))
+    weighting = Weighting(candidates.REFINE.kernel, None, distance, candidates.REFINE.trim)
+    found = iterate_all(
+        poses, source, reference, weighting, config=candidates.REFINE, step=candidates.STEP,
+        motions=motions, counted=np.pad(counted, ((0, 0), (0, len(source.padded) - len(moved)))),
+    )  # fmt: skip
+    turns, shifts = nearest_rotation(found.rotation), found.translation
+    one, other = slice(None, len(first)), slice(len(first), None)
+    between = turns[one] @ turns[other].swapaxes(1, 2)
+    shift = shifts[one] - (between @ shifts[other][..., None])[..., 0]
+    return np.column_stack([Rotation.from_matrix(between).as_rotvec(), shift]) / 2
 
 
 def widened(
@@ -64,9 +68,11 @@ def widened(
     """The covariance, and a share of how far halves differ, where that is more than it says.
 
     With ``D = mean d d^T`` and ``q = trace(C^+ D) / free``, of so many unknown motions:
-    ``C + share max(0, 1 - said / q) (D + q C) / 2``. Few halves show few of the directions, so half
-    of it goes into all.
+    ``C + share max(0, 1 - said / q) (D + q C) / 2``. Two differences show two of the directions, so
+    half of it goes into all.
     """
+    if len(found) == 0:
+        return covariance
     inverse = np.linalg.pinv(covariance, rcond=1e-14, hermitian=True)
     spread = found.T @ found / len(found)
     ratio = float(np.sum(inverse * spread)) / free

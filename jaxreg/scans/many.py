@@ -313,6 +313,7 @@ class _Run(NamedTuple):
 
 def _find_pairs(run: _Run, times: np.ndarray | None, starts: list[np.ndarray | None]) -> None:
     """Register pairs until every scan is held by several, or no promising pair is left."""
+    run.report(0, 0, "comparing the scans")
     likeness = proposals.likeness(run.prepared)
     if any(start is not None for start in starts):
         run.do(_from_starts(run, starts), "registering pairs from their start")

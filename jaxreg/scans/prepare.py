@@ -53,7 +53,6 @@ class Level:
     _described: dict[tuple[float, int, tuple[float, ...]], Described] = dataclasses.field(
         default_factory=dict
     )
-    _halved: dict[int, tuple[IndexedCloud, IndexedCloud]] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def index(self) -> IndexedCloud:
@@ -67,18 +66,6 @@ class Level:
             return spacing(self.points, self.index.tree)
         fourth = self.index.neighbors[: len(self.points), _FOURTH - 1]
         return float(np.median(np.linalg.norm(self.points - self.points[fourth], axis=1)))
-
-    def halved(self, number: int) -> tuple[IndexedCloud, IndexedCloud]:
-        """Two halves of the points, indexed; each `number` is another split by chance."""
-        if number not in self._halved:
-            order = np.random.default_rng(number).permutation(len(self.points))
-            first, second = (np.sort(order[k::2]) for k in (0, 1))
-            self._halved[number] = self._indexed(first), self._indexed(second)
-        return self._halved[number]
-
-    def _indexed(self, rows: Int[np.ndarray, "p"]) -> IndexedCloud:
-        normals = None if self.normals is None else self.normals[rows]
-        return index_cloud(self.points[rows], k=self.k, normals=normals)
 
     @functools.cached_property
     def examined(self) -> Examined:

@@ -336,7 +336,7 @@ def finished(
         last, covariance = closing.settled.pose, closing.settled.covariance
         refined = refined._replace(transform=last._replace(translation=last.translation / length))
     if thorough and found.probability >= least:
-        covariance = _with_sampling(problem, refined.transform, covariance)
+        covariance = _with_halves(problem, refined.transform, covariance)
     evidence, score = problem.clouds().judge(
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
     )
@@ -382,24 +382,18 @@ def finished(
     )
 
 
-def _with_sampling(
+def _with_halves(
     problem: Problem, pose: RigidTransform, covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "6 6"]:
-    """The covariance of a pose, wider where halves of small clouds tell that sampling moves it."""
-    sides, config = (problem.source, problem.reference), problem.config
-    levels = (sides[0].fine, sides[1].fine)
-    small = all(halves.LEAST <= len(level.points) <= halves.MOST for level in levels)
-    if config.refine is None or not (small and config.halvings and np.isfinite(covariance).all()):
+    """The covariance of a pose, wider where halves of the overlap differ by more than it says."""
+    config, motions = problem.config, problem.motions
+    if config.refine is None or not config.halves or not np.isfinite(covariance).all():
         return covariance
-    length = float(problem.where.length)
-    found = halves.differences(
-        levels, (sides[0].radius / length, sides[1].radius / length), pose,
-        halvings=config.halvings, distance=problem.reach(), config=config.refine,
-        motions=problem.motions,
-    )  # fmt: skip
-    units = np.repeat([1.0, length], 3)
+    source, reference, *_ = problem.clouds()
+    found = halves.differences(source, reference, pose, distance=problem.reach(), motions=motions)
+    units = np.repeat([1.0, float(problem.where.length)], 3)
     units = np.outer(units, units)
-    free = 6 if problem.motions is None else problem.motions.shape[1]
+    free = 6 if motions is None else motions.shape[1]
     return halves.widened(covariance / units, found, free) * units
 
 
