@@ -19,11 +19,9 @@ from jaxreg.types import RigidTransform
 
 _LEAST = 64
 """Points of an overlap that is halved."""
-_SHARE = 0.5
-"""Of the spread of the halves: each has half of the points and of the extent, so that its pose is
-less certain than that of the whole."""
-_SAID = 3.0
-"""Halves that differ by no more than so many times what the covariance says do not widen it."""
+_SAID = 4.0
+"""Halves that differ by no more than so many times what the covariance says do not widen it: each has
+half of the points and of the extent, so that its pose is less certain than that of the whole."""
 
 
 def differences(
@@ -65,10 +63,10 @@ def differences(
 def widened(
     covariance: Float[np.ndarray, "6 6"], found: Float[np.ndarray, "s 6"], free: int
 ) -> Float[np.ndarray, "6 6"]:
-    """The covariance, and a share of how far halves differ, where that is more than it says.
+    """The covariance, and how far halves differ, where that is more than it says.
 
     With ``D = mean d d^T`` and ``q = trace(C^+ D) / free``, of so many unknown motions:
-    ``C + share max(0, 1 - said / q) (D + q C) / 2``. Two differences show two of the directions, so
+    ``C + max(0, 1 - 4 / q) (D + q C) / 2``. Two differences show two of the directions, so
     half of it goes into all.
     """
     if len(found) == 0:
@@ -76,5 +74,5 @@ def widened(
     inverse = np.linalg.pinv(covariance, rcond=1e-14, hermitian=True)
     spread = found.T @ found / len(found)
     ratio = float(np.sum(inverse * spread)) / free
-    more = _SHARE * max(0.0, 1 - _SAID / max(ratio, _SAID))
+    more = max(0.0, 1 - _SAID / max(ratio, _SAID))
     return covariance + more * (spread + ratio * covariance) / 2

@@ -41,7 +41,7 @@ def test_the_covariance_grows_with_what_it_did_not_say(seed):
     units = np.linalg.inv(root)
     wider = units @ halves.widened(covariance, found, 6) @ units.T
     ratio = 30**2 / 6
-    more = 0.5 * (1 - 3 / ratio) / 2
+    more = (1 - 4 / ratio) / 2
     expected = (1 + more * ratio) * np.eye(6) + more * 900 * np.outer(along, along)
     np.testing.assert_allclose(wider, expected, rtol=1e-6, atol=1e-9)
 
