@@ -340,7 +340,7 @@ def load_config(path: str | Path) -> Config:
         shipped = _shipped() / f"{path.name.removesuffix('.toml')}.toml"
         path = shipped if shipped.exists() else path
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ValueError(
             f"no configuration file at {path}: give the path of a file, or one of the names that come "

@@ -24,7 +24,7 @@ def neighborhood_covariances(
     """Covariance of every point together with its neighbours, ``1/c sum (x - mean)(x - mean)^T``.
 
     `neighbors` are rows of `points`, as `jaxreg.knn` gives them; a point that fills its own list
-    counts once. Padded rows give zero.
+    counts once, and a row that does not exist is left out. Padded rows give zero.
 
     Raises:
       ValueError: a shape or a dtype is wrong; the message names the argument.
@@ -43,6 +43,8 @@ def _offsets(points, neighbors, mask) -> tuple[Array, Array]:
     mask = arguments.mask("mask", mask, points.shape[0])
     points = without_padding(points, mask)
     own = jnp.arange(points.shape[0], dtype=neighbors.dtype)[:, None]
+    # As a k-d tree of scipy says that there is no such neighbour; clamped it would be the last point.
+    neighbors = jnp.where((neighbors < 0) | (neighbors >= points.shape[0]), own, neighbors)
     counts = jnp.concatenate([jnp.ones_like(own, bool), neighbors != own], axis=1)
     if mask is not None:
         counts = counts & mask[:, None]

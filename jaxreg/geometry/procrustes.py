@@ -39,6 +39,8 @@ def weighted_procrustes(
     reference = arguments.rows("reference", reference, source.shape, source)
     weights = arguments.rows("weights", weights, source.shape[:1], source)
     weights = jnp.maximum(weights, 0)
+    # What weighs nothing counts for nothing, NaN and infinity as well.
+    source, reference = (jnp.where(weights[:, None] > 0, x, 0) for x in (source, reference))
     largest = jnp.max(weights, initial=0)
     # Only the proportions of the weights matter; this keeps tiny and huge ones in range.
     weights = weights / jnp.where(largest > 0, largest, 1)

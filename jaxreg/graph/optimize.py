@@ -4,19 +4,19 @@ Levenberg-Marquardt with conjugate gradients: memory grows with the edges, nothi
 the host `sparse` solves the same problem by a sparse factorisation, which long chains need.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import export
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.geometry import arguments, se3
+from jaxreg.geometry import se3
 from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.graph.pose_graph import (
     CHI_SQUARED,
     PoseGraph,
-    check_indices,
+    check_graph,
     edge_equations,
     retract,
     squared_errors,
@@ -45,6 +45,9 @@ class OptimizedPoses(NamedTuple):
     weights: Float[Array, "e"]
     squared_errors: Float[Array, "e"]
     decrement: Float[Array, ""]
+
+
+export.register_namedtuple_serialization(OptimizedPoses, serialized_name="jaxreg.OptimizedPoses")
 
 
 class _Blocks(NamedTuple):
@@ -88,7 +91,13 @@ def optimize_poses(
       ValueError: an array has another shape than `PoseGraph` says, or an index, where it is not traced,
         is out of range.
     """
-    _check(graph, initial, fixed)
+    check_graph(graph, initial, fixed=fixed)
+    kinds = [jnp.result_type(x) for x in (*graph.transform, graph.information, *initial)]
+    if len(set(kinds)) > 1 or kinds[0] not in (jnp.float32, jnp.float64):
+        raise ValueError(
+            f"transforms, information and initial poses have the dtypes {', '.join(map(str, kinds))}: "
+            "give all of them in float32, or in float64."
+        )
     # Where some are numpy's, others must not be traced by numpy.
     graph, initial = jax.tree.map(jnp.asarray, (graph, initial))
     count = initial.translation.shape[0]
@@ -113,37 +122,6 @@ def optimize_poses(
     step, decrement = _implicit_step(graph, state.poses, held, state.weights, most)
     poses = retract(state.poses, step)
     return OptimizedPoses(poses, state.weights, squared_errors(graph, poses), decrement)
-
-
-def _check(graph: PoseGraph, initial: RigidTransform, fixed: Any) -> None:
-    """At trace time: a row that does not exist would be clamped, and another pose moved."""
-    poses = arguments.leading_axes("initial", initial)
-    if len(poses) != 1:
-        raise ValueError(
-            f"initial must be poses with one leading axis, got {poses}: give one pose for every scan, "
-            "and use jax.vmap for a batch."
-        )
-    shapes = [
-        ("source", np.shape(graph.source), ()),
-        ("reference", np.shape(graph.reference), ()),
-        ("transform", arguments.leading_axes("graph.transform", graph.transform), ()),
-        ("information", np.shape(graph.information), (6, 6)),
-        ("mask", np.shape(graph.mask), ()),
-    ]
-    edges = np.shape(graph.source)[:1]
-    for name, shape, rest in shapes:
-        if len(edges) != 1 or shape != (*edges, *rest):
-            raise ValueError(
-                f"graph.{name} is {shape}, but graph.source {np.shape(graph.source)}: give one row for "
-                "every edge."
-            )
-    for name, flags, count in (("graph.mask", graph.mask, edges), ("fixed", fixed, poses)):
-        if flags is not None and (np.shape(flags) != count or jnp.result_type(flags).kind != "b"):
-            raise ValueError(
-                f"{name} must be bool of shape {count}, got {jnp.result_type(flags)} of "
-                f"{np.shape(flags)}."
-            )
-    check_indices(graph, *poses)
 
 
 def _step(graph: PoseGraph, held, state: _State, most: int) -> _State:

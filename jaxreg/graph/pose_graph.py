@@ -9,10 +9,11 @@ its reference, so that without errors ``Z = X_r^-1 X_s``. Its residual is
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax import export
 from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
-from jaxreg.geometry import se3
+from jaxreg.geometry import arguments, se3
 from jaxreg.types import RigidTransform
 
 CHI_SQUARED = 16.8
@@ -31,6 +32,53 @@ class PoseGraph(NamedTuple):
     transform: RigidTransform
     information: Float[Any, "e 6 6"]
     mask: Bool[Any, "e"]
+
+
+export.register_namedtuple_serialization(PoseGraph, serialized_name="jaxreg.PoseGraph")
+
+
+def check_graph(graph: PoseGraph, initial: RigidTransform, **flags: Any) -> None:
+    """Raise ValueError unless every array has its shape, and indices are those of poses.
+
+    `flags` are further masks by their names: `fixed`, one a pose, and others, one an edge. At trace
+    time: a row that does not exist would be clamped, and another pose moved.
+    """
+    if not isinstance(initial, RigidTransform):
+        raise ValueError(
+            f"initial is {type(initial).__name__}: give a RigidTransform with a leading axis, as "
+            "jaxreg.from_matrix makes it of (n, 4, 4)."
+        )
+    poses = arguments.leading_axes("initial", initial)
+    if len(poses) != 1:
+        raise ValueError(
+            f"initial must be poses with one leading axis, got {poses}: give one pose for every scan, "
+            "and use jax.vmap for a batch."
+        )
+    shapes = [
+        ("source", np.shape(graph.source), ()),
+        ("reference", np.shape(graph.reference), ()),
+        ("transform", arguments.leading_axes("graph.transform", graph.transform), ()),
+        ("information", np.shape(graph.information), (6, 6)),
+        ("mask", np.shape(graph.mask), ()),
+    ]
+    edges = np.shape(graph.source)[:1]
+    for name, shape, rest in shapes:
+        if len(edges) != 1 or shape != (*edges, *rest):
+            raise ValueError(
+                f"graph.{name} is {shape}, but graph.source {np.shape(graph.source)}: give one row for "
+                "every edge."
+            )
+    for name, given in (("graph.mask", graph.mask), *flags.items()):
+        count = poses if name == "fixed" else edges
+        if given is not None and (np.shape(given) != count or _dtype(given).kind != "b"):
+            raise ValueError(
+                f"{name} must be bool of shape {count}, got {_dtype(given)} of {np.shape(given)}."
+            )
+    check_indices(graph, *poses)
+
+
+def _dtype(array: Any) -> np.dtype:
+    return array.dtype if hasattr(array, "dtype") else np.asarray(array).dtype
 
 
 def check_indices(graph: PoseGraph, count: int) -> None:

@@ -15,7 +15,7 @@ from jaxreg.graph.pose_graph import (
     CHI_SQUARED,
     EdgeEquations,
     PoseGraph,
-    check_indices,
+    check_graph,
     edge_equations,
     retract,
     squared_errors,
@@ -63,8 +63,10 @@ def solve_poses(
     never left out. A node without edges keeps its pose.
 
     Raises:
-      ValueError: an index is out of range, or a pose or an edge is not finite.
+      ValueError: an array has another shape than `PoseGraph` says, an index is out of range, or a pose
+        or an edge is not finite.
     """
+    check_graph(graph, initial, fixed=fixed, trusted=trusted)
     problem = _Problem.of(graph, initial, fixed)
     poses, weights = problem.start, problem.graph.mask.astype(np.float64)
     if robust:
@@ -102,7 +104,6 @@ class _Problem(NamedTuple):
 
 
 def _check(graph: PoseGraph, initial: RigidTransform) -> None:
-    check_indices(graph, len(initial.translation))
     kept = np.asarray(graph.mask, bool)
     if not all(np.isfinite(part).all() for part in initial):
         raise ValueError("an initial pose is not finite: give one for every scan.")

@@ -107,6 +107,12 @@ def _scan(array: np.ndarray, where: str) -> Scan:
 def _points(array: np.ndarray, where: str) -> np.ndarray:
     if array.dtype.names and set("xyz") <= set(array.dtype.names):
         array = np.stack([array[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    columns = array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[0] == 4 < array.shape[1]
+    if columns and np.all(array[3] == 1):
+        raise ValueError(
+            f"{where} is {array.dtype} {array.shape}, one homogeneous point per column: save the "
+            "transpose of its first three rows (n, 3)."
+        )
     if array.dtype.kind in "fiu" and array.ndim == 2 and array.shape[0] == 3 < array.shape[1]:
         raise ValueError(
             f"{where} is {array.dtype} {array.shape}, one point per column: save its transpose (n, 3)."
@@ -121,6 +127,17 @@ def _points(array: np.ndarray, where: str) -> np.ndarray:
             "save one point per row."
         )
     return array[:, :3].astype(np.float64)
+
+
+def more(path: Path) -> tuple[str, ...]:
+    """What the file holds besides x, y, z."""
+    loaded = _loaded(path)
+    if isinstance(loaded, dict):
+        return tuple(name for name in loaded if name != "points") if "points" in loaded else ()
+    if loaded.dtype.names:
+        return tuple(name for name in loaded.dtype.names if name not in "xyz")
+    further = loaded.shape[1] - 3 if loaded.ndim == 2 else 0
+    return (f"{further} further columns",) if further > 0 else ()
 
 
 def write(path: Path, points: np.ndarray) -> None:

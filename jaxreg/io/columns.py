@@ -35,6 +35,12 @@ def coordinates(names: Sequence[str]) -> tuple[int, int, int] | None:
     return None if height is None else (plan.index("x"), plan.index("y"), height)
 
 
+def plane(names: Sequence[str]) -> tuple[int, int] | None:
+    """Where x and y stand among two names, as `coordinates` knows them; None where they do not."""
+    found = coordinates([*names, "z"])
+    return None if found is None else found[:2]
+
+
 def normals(names: Sequence[str]) -> tuple[int, int, int] | None:
     """Where the components of a normal stand: nx ny nz, normal_x, Normals:0; None without them."""
     found = [match[1].lower() if (match := _NORMALS.fullmatch(name)) else "" for name in names]

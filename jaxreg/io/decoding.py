@@ -7,9 +7,12 @@ from pathlib import Path
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+_END_OF_FILE = "\x1a"
+"""What DOS writes behind the last line."""
 _CONTROL = re.compile("[\0-\x08\x0e-\x19\x1b-\x1f]")
 _WORD = re.compile(r"[0-9A-Za-z#]")
 _PLAIN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
@@ -31,6 +34,7 @@ def decoded(path: Path, content: bytes) -> str:
       ValueError: it holds control characters, as binary files do, or no letter or digit at all.
     """
     text = content.decode(_encoding(content), errors="replace").replace("\ufeff", "")
+    text = text.removesuffix(_END_OF_FILE)
     if _CONTROL.search(text) or (text.strip() and not _WORD.search(text)):
         raise ValueError(
             f"{path} is not a text file: give it the suffix of its format, or export it as text."

@@ -18,7 +18,16 @@ _REMARK = re.compile(r"(?<!\d[.,])#|//")
 _UNIT = re.compile(r"\s+(?=[\[(][^\W\d]+[\])])")
 """The blank in "X [m]", which parts no columns."""
 _COMMA = re.compile(r"(?<![\d.,])[+-]?\d*,\d+([eE][+-]?\d+)?(?![\d.,])")
-_POINT = re.compile(r"\d\.\d")
+_POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
+_BOTH = re.compile(r"\d,\d.*,\s")
+"""As in "1,5, 2,25"."""
+_JOINING = {"from", "by", "of", "for", "the", "with", "in", "at", "to", "and", "is", "are", "on"}
+"""Words of a sentence, which stand in no header."""
+_FACES = {"f", "vn", "vt"}
+_WIDE = 20
+"""Three lines of more numbers than this are three coordinates of many points."""
+_LABELS = 10
+"""From so many rows on whole numbers that are all unlike, beside decimals, are names of points."""
 _WHOLE = re.compile(r"[+-]?\d+")
 _COUNT = re.compile(r"\d{1,18}")
 """A number that `int` reads: it takes no "²", and no more than some thousands of digits."""
@@ -57,10 +66,20 @@ def is_data(line: str) -> bool:
     return bool(stripped) and not stripped.startswith(_COMMENTS)
 
 
+def parted(line: str, separator: str) -> list[str]:
+    """The fields of a line as they stand; between quotes a separator parts nothing."""
+    if '"' not in line:
+        return line.split(separator)
+    mark = re.escape(separator)
+    field = rf'\s*"(?:[^"]|"")*"\s*(?={mark}|$)|[^{mark}]*'
+    return re.findall(rf"(?:^|{mark})({field})", line)
+
+
 def split(line: str, separator: str | None) -> list[str]:
     """The fields of a line, without blanks and quotes around them."""
     line = line.strip(" \n" if separator else None)
-    return [field.strip().strip('"') for field in line.split(separator)]
+    fields = line.split() if separator is None else parted(line, separator)
+    return [field.strip().strip('"') for field in fields]
 
 
 def is_count(field: str) -> bool:
@@ -88,6 +107,9 @@ def recognised(path: Path, text: str) -> Layout | None:
     start = next((i for i, row in enumerate(rows) if _is_point(row, comma)), None)
     if start is None:
         return _without_points(path, data, rows)
+    _check_marks(path, tail, rows[start:], separator, comma)
+    while start > 0 and _is_empty_point(rows[start - 1], rows[start], comma):
+        start -= 1
     first, width = data[start][0], len(rows[start])
     count = next((int(row[0]) for row in rows[:start] if _announces(row)), None)
     counted = {data[i][0] for i in range(start) if _announces(rows[i])}
@@ -97,7 +119,9 @@ def recognised(path: Path, text: str) -> Layout | None:
     if names is not None:
         chosen, across = columns.coordinates(names), columns.normals(names)
         _check_commas(path, above, names, rows, separator)
+        _check_row_names(path, above, names, rows)
     else:
+        _check_turned(path, first, rows, data)
         chosen = _unnamed(path, first, rows, comma)
         across = _beside(path, rows, chosen, comma)
     return Layout(separator, comma, chosen or (0, 1, 2), across, first, count)
@@ -120,15 +144,77 @@ def _separator(sample: list[str]) -> tuple[str | None, bool]:
     sample = [uncommented(line) for line in sample]
     body = "\n".join(sample)
     strong = next((mark for mark in (";", "|") if mark in body), None)
-    comma = bool(_COMMA.search(body)) and not _POINT.search(body)
     if strong:
-        return strong, comma
-    comma = comma and all(_by_blanks(line) for line in sample)
+        return strong, _decimal_comma(sample, strong)
+    comma = _decimal_comma(sample, None) and all(_by_blanks(line) for line in sample)
     if "," in body and not comma:
-        return ",", False
+        return ",", '"' in body and _decimal_comma(sample, ",")
     fields = [line.split("\t") for line in sample]
     alone = all(len(row) > 2 and not any(" " in f.strip() for f in row) for row in fields)
     return ("\t" if alone else None), comma
+
+
+def _decimal_comma(sample: list[str], separator: str | None) -> bool:
+    """Whether fields are numbers with a comma; what others hold, a date or a name, tells nothing."""
+    fields = [field for line in sample for field in split(line, separator)]
+    if separator is None:  # also where blanks and commas part "1,5, 2"
+        fields = [field for field in fields if not field.endswith(",")]
+    return any(map(_COMMA.fullmatch, fields)) and not any(map(_POINT.fullmatch, fields))
+
+
+def _check_marks(
+    path: Path,
+    tail: list[tuple[int, str]],
+    rows: list[list[str]],
+    separator: str | None,
+    comma: bool,
+) -> None:
+    """Raises ValueError where numbers have decimal points as well as commas, or commas part both.
+
+    And where the lines are those of an OBJ file.
+    """
+    if {row[0] for row in rows} & _FACES and any(row[0] == "v" for row in rows):
+        raise ValueError(f"{path} has the vertices and faces of an OBJ file: name it '.obj'.")
+    fields = [field for row in rows for field in row]
+    if separator in (";", "|", "\t") and not comma and any(map(_COMMA.fullmatch, fields)):
+        raise ValueError(
+            f"{path}, line {tail[0][0]}: some numbers have a decimal comma and some a decimal point: "
+            "export the file with one of them."
+        )
+    plain = [uncommented(line).strip() for _, line in tail]
+    both = separator == "," and all(_BOTH.search(line) for line in plain)
+    if both and not any(_POINT.fullmatch(field) for field in fields):
+        raise ValueError(
+            f"{path}, line {tail[0][0]}: commas seem to part the columns and to be the decimal "
+            "marks: export the file with decimal points, or with semicolons between the columns."
+        )
+
+
+def _is_empty_point(row: list[str], point: list[str], comma: bool) -> bool:
+    """Whether a row above the first point is one of NaN alone: it keeps its place."""
+    values = [number(field, comma=comma) for field in row]
+    return len(row) == len(point) and None not in values and not any(v == v for v in values)
+
+
+def _check_row_names(path: Path, above: list, names: list[str], rows: list[list[str]]) -> None:
+    """Raises ValueError where a column without a name seems to number the points, as R writes it."""
+    label = [row[0] for row in rows]
+    if len(names) == len(rows[0]) - 1 and all(map(is_count, label)):
+        steps = {int(b) - int(a) for a, b in zip(label, label[1:], strict=False)}
+        if steps == {1}:
+            raise ValueError(
+                f"{path}, line {above[-1][0]}: {len(names)} names stand above {len(rows[0])} columns, "
+                "of which the first seems to number the points: give it a name, too."
+            )
+
+
+def _check_turned(path: Path, first: int, rows: list[list[str]], data: list) -> None:
+    """Raises ValueError where three lines hold the three coordinates of many points."""
+    if len(rows) == len(data) == 3 and len(rows[0]) > _WIDE and len(set(map(len, rows))) == 1:
+        raise ValueError(
+            f"{path}, line {first}: three lines of {len(rows[0])} numbers each, one point per column: "
+            "write one point a line."
+        )
 
 
 def _by_blanks(line: str) -> bool:
@@ -221,6 +307,7 @@ def _check_header(
     # A comment is a header only on the first line, and not if it is a remark like "by: me".
     titled = first and all(_is_name(name) for name in names)
     titled = titled and not _LABEL.match(_joined(line, separator))
+    titled = titled and not _JOINING & {name.lower() for name in names}
     if len(names) == width >= 3 and (is_data(line) or titled):
         raise ValueError(
             f"{where}: the header names the columns {', '.join(names)[:80]}, not x, y, z: call "
@@ -254,7 +341,8 @@ def _unnamed(
         label = [row[run[0]] for row in rows]
         others = [[row[c] for row in rows] for c in run[1:4]]
         parts = [sum("." in f or "," in f for f in column) > len(rows) / 2 for column in others]
-        if sum(parts) >= 2 and all(map(is_count, label)) and _rises(label):
+        unlike = len(label) >= _LABELS and len(set(label)) == len(label)
+        if sum(parts) >= 2 and all(map(is_count, label)) and (unlike or _rises(label)):
             raise ValueError(
                 f"{path}, line {first}: column {run[0] + 1} seems to number the points ({label[0]}, "
                 f"{label[1]}, {label[2]} ...), and no header says so: put a line above the points "
@@ -271,16 +359,20 @@ def _rises(label: list[str]) -> bool:
 def _beside(
     path: Path, rows: list[list[str]], chosen: tuple[int, int, int] | None, comma: bool
 ) -> tuple[int, int, int] | None:
-    """The three columns after x y z where they hold unit vectors: normals."""
-    if chosen is None or min(map(len, rows)) < chosen[2] + 4:
-        return None
-    three = (chosen[2] + 1, chosen[2] + 2, chosen[2] + 3)
-    for row in rows:
-        vector = [number(row[c], comma=comma) for c in three]
-        length = sum(v * v for v in vector if v is not None)
-        if None in vector or abs(length - 1) > 1e-2:
+    """The three columns after x y z, or after three more (a colour), where they hold unit vectors."""
+    width = min(map(len, rows))
+    for after in (1, 4):
+        if chosen is None or width < chosen[2] + after + 3:
             return None
-    return three
+        three = (chosen[2] + after, chosen[2] + after + 1, chosen[2] + after + 2)
+        if all(_is_unit([number(row[c], comma=comma) for c in three]) for row in rows):
+            return three
+    return None
+
+
+def _is_unit(vector: list[float | None]) -> bool:
+    known = [value for value in vector if value is not None]
+    return len(known) == len(vector) and abs(sum(value * value for value in known) - 1) <= 1e-2
 
 
 def _namings(line: str, separator: str | None) -> list[list[str]]:

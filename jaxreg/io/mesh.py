@@ -18,6 +18,13 @@ _POINTS = 20_000
 _GLUED = re.compile(rb"^\s*([CN]*OFF)[ \t]*(?=[\d-])")
 """ModelNet has files that begin with "OFF1568 1242 0" on one line."""
 SUFFIXES = (".stl", ".obj", ".off", ".glb", ".ply")
+_MORE = {
+    ".obj": re.compile(rb"^\s*(?:(?:vn|vt|usemtl)\s|v(?:[ \t]+[^\s#]+){4})", re.MULTILINE),
+    ".off": re.compile(rb"^\s*[STCN4]+n?OFF", re.MULTILINE),
+}
+"""What a vertex or a face has besides coordinates and corners."""
+_CONTINUED = re.compile(r"(?m)^([ \t]*vn?[ \t][^\n]*)\\\n")
+_FROM_THE_END = re.compile(rb"^\s*f\s[^\n]*[\s/]-\d", re.MULTILINE)
 _NARROW = (".stl", ".glb")
 """Formats that store coordinates in single precision."""
 
@@ -113,6 +120,12 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
     return _export(path, Mesh(mesh.vertices @ rotation.T + translation, mesh.faces))
 
 
+def more(path: Path) -> tuple[str, ...]:
+    """What an OBJ or OFF file holds besides vertices and faces."""
+    found = _MORE[path.suffix.lower()].search(as_utf8(path.read_bytes()))
+    return ("normals, colours or textures",) if found else ()
+
+
 def rounding(suffix: str, points: np.ndarray) -> float:
     """By how much coordinates are rounded in a mesh of this format; 0 where it stores doubles."""
     if suffix not in _NARROW or len(points) == 0:
@@ -134,11 +147,19 @@ def _export(path: Path, mesh: Mesh) -> None:
 
 def _write_obj(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
     """Line by line: vertices moved, normals turned, groups, textures and faces as they are."""
+    text = decoded(original, original.read_bytes())
+    while (joined := _CONTINUED.sub(r"\1 ", text)) != text:
+        text = joined
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        for line in decoded(original, original.read_bytes()).splitlines():
+        for line in text.splitlines():
             words = line.split()
             if words and words[0] in ("v", "vn") and len(words) > 3:
-                numbers = [float(word.replace(",", ".")) for word in words[1:4]]
+                try:
+                    numbers = [float(word.replace(",", ".")) for word in words[1:4]]
+                except ValueError:
+                    raise ValueError(
+                        f"{original}: '{line[:60]}' is no vertex: export the file again."
+                    ) from None
                 vertex = words[0] == "v"
                 moved = rotation @ numbers + translation if vertex else turn_of(rotation) @ numbers
                 line = " ".join([words[0], *(f"{x:.12g}" for x in moved), *words[4:]])
@@ -152,6 +173,8 @@ def _by_trimesh(path: Path, kind: str) -> Mesh:
     if kind in ("obj", "off"):
         content = with_points(as_utf8(content))
         content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if kind == "obj":
+        content = _plain_obj(content)
     if kind == "off":
         content = _GLUED.sub(rb"\1\n", content, count=1)
     shape = _loaded(path, content, kind)
@@ -162,6 +185,35 @@ def _by_trimesh(path: Path, kind: str) -> Mesh:
     vertices = np.asarray(getattr(shape, "vertices", np.empty((0, 3))), np.float64)
     faces = np.asarray(getattr(shape, "faces", ()), np.int64).reshape(-1, 3)
     return Mesh(vertices, faces)
+
+
+def _plain_obj(content: bytes) -> bytes:
+    """Without what trimesh does not read: tabs, remarks behind a line, and indices from the end.
+
+    These count from the last vertex *above* the face.
+    """
+    content = content.replace(b"\\\n", b" ").replace(b"\t", b" ")
+    if b"#" in content:
+        content = re.sub(rb"[ ]#[^\n]*", b"", content)
+    if not _FROM_THE_END.search(content):
+        return content
+    counts, made = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    for line in content.split(b"\n"):
+        words = line.split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        if words and words[0] == b"f":
+            corners = [corner.split(b"/") for corner in words[1:]]
+            line = b"f " + b" ".join(b"/".join(_counted(c, counts)) for c in corners)
+        made.append(line)
+    return b"\n".join(made)
+
+
+def _counted(corner: list[bytes], counts: dict[bytes, int]) -> list[bytes]:
+    return [
+        b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index
+        for index, count in zip(corner, counts.values(), strict=False)
+    ]
 
 
 def _loaded(path: Path, content: bytes, kind: str):

@@ -19,6 +19,12 @@ _FREE = 1 << 16
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
 """The marks of UTF-16."""
 _NORMALS = ("nx", "ny", "nz")
+_TURNS = ("rot_0", "rot_1", "rot_2", "rot_3")
+"""The quaternion of a Gaussian splat, w first."""
+_SIZES = ("scale_0", "scale_1", "scale_2")
+"""The logarithms of its extents."""
+_BLANKS = re.compile(r"(?m)^end_header[ \t]+")
+_CAPITAL = re.compile(r"(?m)^(property\s+\w+\s+)([XYZ])([ \t\r]*)$")
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -74,10 +80,13 @@ def write(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> No
     PlyData(elements, byte_order="<").write(str(path))
 
 
-def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray) -> None:
+def write_moved(
+    path: Path, original: Path, rotation: np.ndarray, translation: np.ndarray
+) -> tuple[str, ...]:
     """Write a PLY file again with its vertices (and normals) moved and everything else kept.
 
-    x, y, z become double, so large offsets lose nothing.
+    x, y, z become double, so large offsets lose nothing. Gaussian splats turn with their centres; of
+    their colours what depends on the direction of view does not, and that is returned as a note.
     """
     data = _told(original)
     elements = []
@@ -88,6 +97,10 @@ def write_moved(path: Path, original: Path, rotation: np.ndarray, translation: n
         elements.append(element)
     header = {"comments": data.comments, "obj_info": data.obj_info}
     PlyData(elements, text=data.text, byte_order=data.byte_order, **header).write(str(path))
+    fields = data["vertex"].data.dtype.names or ()
+    if "f_rest_0" not in fields:
+        return ()
+    return ("the colours of splats by direction of view (f_rest_*) are not turned",)
 
 
 def _told(path: Path) -> PlyData:
@@ -131,7 +144,8 @@ def _readable(path: Path) -> Iterator[tuple[Path, dict[str, dict[str, int]]]]:
     header = _header(head)
     text = re.search(rb"^format\s+ascii", header, re.MULTILINE) is not None
     lists = _lists(path, header, path.stat().st_size, text=text)
-    if plain and header.isascii() and not text:
+    as_it_is = not text and not _capitals(header) and not re.search(rb"end_header[ \t]", header)
+    if plain and header.isascii() and as_it_is:
         yield path, lists
         return
     content = path.read_bytes()
@@ -163,10 +177,19 @@ def _cleaned(content: bytes, *, text: bool) -> bytes:
         header = content[:cut].decode("utf-8")
     except UnicodeDecodeError:
         header = content[:cut].decode("latin-1")
+    header = _BLANKS.sub("end_header", header)
+    if _capitals(content[:cut]):
+        header = _CAPITAL.sub(lambda m: m[1] + m[2].lower() + m[3], header)
     body = content[cut:]
     if text:
         body = with_points(body.replace(b"\xef\xbb\xbf", b""))
     return header.encode("ascii", "replace") + body
+
+
+def _capitals(header: bytes) -> bool:
+    """Whether coordinates are named X, Y, Z, and none x, y, z."""
+    names = {m[2] for m in _CAPITAL.finditer(header.decode("latin-1"))}
+    return names == set("XYZ") and not re.search(rb"(?m)^property\s+\w+\s+[xyz]\s*$", header)
 
 
 def _lists(path: Path, header: bytes, size: int, *, text: bool) -> dict[str, dict[str, int]]:
@@ -229,4 +252,15 @@ def _moved(vertex: np.ndarray, rotation: np.ndarray, translation: np.ndarray) ->
         normals = np.stack([vertex[name] for name in _NORMALS], axis=1)
         for name, column in zip(_NORMALS, (normals @ turn_of(rotation).T).T, strict=True):
             moved[name] = column
+    if set(_TURNS) <= set(fields):
+        from scipy.spatial.transform import Rotation  # start-up of programs that only import this
+
+        w, *axis = (vertex[name] for name in _TURNS)
+        turned = Rotation.from_matrix(turn_of(rotation)) * Rotation.from_quat(
+            np.stack([*axis, w], 1)
+        )
+        for name, column in zip((*_TURNS[1:], _TURNS[0]), turned.as_quat().T, strict=True):
+            moved[name] = column
+        for name in set(_SIZES) & set(fields):
+            moved[name] += np.log(np.cbrt(np.linalg.det(rotation)))
     return moved

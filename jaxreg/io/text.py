@@ -7,9 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxreg.io import columns
 from jaxreg.io.contents import TWO_COLUMNS, Scan
 from jaxreg.io.decoding import decoded, number
-from jaxreg.io.layout import Layout, is_count, is_data, lines, recognised, split, uncommented
+from jaxreg.io.layout import (
+    Layout,
+    is_count,
+    is_data,
+    lines,
+    parted,
+    recognised,
+    split,
+    uncommented,
+)
 from jaxreg.io.matrix import turn_of
 
 SUFFIXES = (".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzn", ".xyzrgb", ".xyzi", ".dat")
@@ -38,7 +48,7 @@ def read(path: Path) -> Scan:
             f"{path} is a grid of heights (ESRI), not a list of points: convert it first, as in "
             "gdal_translate -of XYZ grid.asc points.xyz."
         )
-    if (planar := _in_plane(text)) is not None:
+    if (planar := _in_plane(path, text)) is not None:
         return Scan(planar[0], (TWO_COLUMNS,))
     layout = recognised(path, text)
     if layout is None:
@@ -46,12 +56,15 @@ def read(path: Path) -> Scan:
     return Scan(_points(path, text, layout))
 
 
-def _in_plane(text: str) -> tuple[np.ndarray, Layout] | None:
+def _in_plane(path: Path, text: str) -> tuple[np.ndarray, Layout] | None:
     """The points of a file of x and y alone, with z = 0, and its layout; None for any other file.
 
     What parts the columns is told line by line: the separator of the layout is that of no line.
+
+    Raises:
+      ValueError: the two columns are longitude and latitude.
     """
-    rows, first, comma = [], 0, False
+    rows, first, comma, order, angles = [], 0, False, (0, 1), False
     for count, line in lines(text):
         if not is_data(line):
             continue
@@ -60,14 +73,23 @@ def _in_plane(text: str) -> tuple[np.ndarray, Layout] | None:
         fields = [number(field, comma=mark == ";") for field in split(line, mark)]
         if len(fields) != 2 or (None in fields and rows):
             return None
+        if None in fields:
+            names = split(line, mark)
+            angles = angles or columns.geographic(names)
+            order = columns.plane(names) or order
         if None not in fields:
             rows.append(fields)
             first = first or count
             comma = comma or (mark == ";" and "," in line)
     if len(rows) < _FEWEST:
         return None
-    points = np.column_stack([np.array(rows, np.float64), np.zeros(len(rows))])
-    return points, Layout(None, comma, (0, 1), None, first, None)
+    if angles:
+        raise ValueError(
+            f"{path}: the columns are longitude and latitude, angles and no lengths: project them to "
+            "metres first, to UTM for instance."
+        )
+    points = np.column_stack([np.array(rows, np.float64)[:, order], np.zeros(len(rows))])
+    return points, Layout(None, comma, order, None, first, None)
 
 
 def _mark(line: str) -> str | None:
@@ -76,6 +98,17 @@ def _mark(line: str) -> str | None:
     mark = next((mark for mark in ";|" if mark in line), None)
     alone = "," in line and (len(line.split()) == 1 or ", " in line)
     return mark or ("," if alone else None)
+
+
+def more(path: Path) -> tuple[str, ...]:
+    """What a line holds besides x, y, z."""
+    text = decoded(path, path.read_bytes())
+    layout = None if _in_plane(path, text) else recognised(path, text)
+    if layout is None:
+        return ()
+    row = next(line for count, line in lines(text) if count == layout.first)
+    further = len(split(uncommented(row), layout.separator)) - 3
+    return (f"{further} further columns",) if further > 0 else ()
 
 
 def write(path: Path, points: np.ndarray) -> None:
@@ -95,7 +128,7 @@ def write_moved(
     a height beside two columns.
     """
     text = decoded(original, original.read_bytes())
-    planar = _in_plane(text)
+    planar = _in_plane(original, text)
     layout = recognised(original, text) if planar is None else planar[1]
     if layout is None:
         raise ValueError(f"{original} contains no points: choose another file.")
@@ -134,7 +167,8 @@ def _without_height(moved: np.ndarray) -> tuple[str, ...]:
 def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray) -> str:
     body = uncommented(line)
     body = body if body == line else body.rstrip(" ")
-    parts = re.split(r"(\s+)", body) if layout.separator is None else body.split(layout.separator)
+    mark = layout.separator
+    parts = re.split(r"(\s+)", body) if mark is None else parted(body, mark)
     # Between the fields of blanks stand the blanks; before the first may stand some, too.
     places = [i for i, part in enumerate(parts) if layout.separator or part.strip()]
     point = point[: len(layout.columns)]
@@ -148,12 +182,16 @@ def _replaced(line: str, layout: Layout, point: np.ndarray, rotation: np.ndarray
             )
     for column, value in new.items():
         digits = f"{value:.12g}"
-        parts[places[column]] = digits.replace(".", ",") if layout.comma else digits
+        digits = digits.replace(".", ",") if layout.comma else digits
+        parts[places[column]] = (
+            f'"{digits}"' if layout.separator == "," and layout.comma else digits
+        )
     return (layout.separator or "").join(parts) + line[len(body) :]
 
 
 def _points(path: Path, text: str, layout: Layout) -> np.ndarray:
-    if ".#" in text or ",#" in text:  # which numpy would take for the begin of a remark
+    # Numpy would take "#" for the begin of a remark, and part what stands between quotes.
+    if ".#" in text or ",#" in text or ('"' in text and layout.separator is not None):
         return _slowly(path, text, layout)
     try:
         points = np.loadtxt(

@@ -20,7 +20,15 @@ WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
     ".las": las.write,
     ".laz": las.write,
 }
-_MORE: dict[str, Callable[[Path], tuple[str, ...]]] = {".ply": ply.more, ".pcd": pcd.more}
+_MORE: dict[str, Callable[[Path], tuple[str, ...]]] = {
+    ".ply": ply.more,
+    ".pcd": pcd.more,
+    ".npy": arrays.more,
+    ".npz": arrays.more,
+    ".obj": mesh.more,
+    ".off": mesh.more,
+    **dict.fromkeys(text.SUFFIXES, text.more),
+}
 _ROUNDED = 1e-5
 """Rounding by more than this share of the extent is worth a word."""
 
@@ -28,16 +36,22 @@ _ROUNDED = 1e-5
 def write_cloud(path: str | Path, points: Float[np.ndarray, "n 3"]) -> None:
     """Write points in the format of the suffix: float64, in text 12 digits, in LAS integer steps.
 
-    LAS and LAZ leave out rows that are not finite; all other formats keep them.
+    LAS and LAZ leave out rows that are not finite; all other formats keep them. A masked row is NaN.
 
     Raises:
-      ValueError: the points are not (n, 3), the suffix is not writable, the folder does not exist,
-        or LAS gets no finite row.
+      ValueError: the points are not numbers (n, 3), the suffix is not writable, the folder does not
+        exist, or LAS gets no finite row.
       ImportError: a LAS or LAZ file, and laspy is not installed.
     """
     path = Path(path)
     check_writable(path)
-    array = np.asarray(points, np.float64)
+    try:
+        array = np.ma.filled(np.ma.asarray(points).astype(np.float64), np.nan)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"points must be numbers of shape (n, 3), got {type(points).__name__}: of an object give "
+            "its array of points."
+        ) from None
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points must have shape (n, 3), got {array.shape}.")
     WRITERS[path.suffix.lower()](path, array)
@@ -103,7 +117,7 @@ def write_moved(
         if kind in mesh.SUFFIXES and (kind not in WRITERS or mesh.is_mesh(file)):
             mesh.write_moved(path, file, rotation, translation)
             moved = points @ rotation.T + translation
-            return _rounding(kind, moved)
+            return (*_rounding(kind, moved), *_bare(kind, origin, file))
         WRITERS[kind](path, points @ rotation.T + translation)
         return _lost(kind, origin, file)
 
@@ -134,11 +148,23 @@ def _rounding(kind: str, points: np.ndarray) -> tuple[str, ...]:
     )
 
 
+def _bare(kind: str, origin: str, source: Path) -> tuple[str, ...]:
+    """What of a mesh is lost besides its vertices and faces."""
+    kept = kind == origin and kind in (".obj", ".glb", ".ply")
+    more = () if kept or origin not in _MORE else _MORE[origin](source)
+    return (f"{kind} gets vertices and faces alone, without {_listed(more)}",) if more else ()
+
+
+def _listed(more: tuple[str, ...]) -> str:
+    return ", ".join(more[:8]) + (" ..." if len(more) > 8 else "")
+
+
 def _lost(kind: str, origin: str, source: Path) -> tuple[str, ...]:
     more = _MORE[origin](source) if origin in _MORE else ()
     if origin in _LAS:
         more = ("intensity and whatever else a point has",)
     if not more:
         return ()
-    listed = ", ".join(more[:8]) + (" ..." if len(more) > 8 else "")
-    return (f"{kind} gets coordinates alone; {origin} would keep {listed}",)
+    if _own_writer(origin, origin) is None:
+        return (f"{kind} gets coordinates alone, without {_listed(more)}",)
+    return (f"{kind} gets coordinates alone; {origin} would keep {_listed(more)}",)

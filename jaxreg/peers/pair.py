@@ -47,7 +47,17 @@ def clouds(
 
 
 def in_dtype(variables: Any, dtype: Any) -> Any:
-    """The weights in the precision of the clouds."""
+    """The weights in the precision of the clouds.
+
+    Raises:
+      ValueError: `variables` lack their parameters or their statistics.
+    """
+    lacking = [kind for kind in ("params", "batch_stats") if kind not in variables]
+    if lacking:
+        raise ValueError(
+            f"variables have no '{lacking[0]}': give both parts, as init_variables and "
+            "jaxreg.load_pretrained return them."
+        )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), variables)
 
 

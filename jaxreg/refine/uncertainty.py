@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._xla import on_any_mesh
@@ -63,6 +64,9 @@ class PoseUncertainty(NamedTuple):
     weight: Float[Any, ""]
     centre: Float[Any, "3"]
     length: Float[Any, ""]
+
+
+export.register_namedtuple_serialization(PoseUncertainty, serialized_name="jaxreg.PoseUncertainty")
 
 
 class WeakDirection(NamedTuple):

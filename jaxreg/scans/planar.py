@@ -18,7 +18,7 @@ from jaxreg.judge.evidence import REACH, Evidence
 from jaxreg.judge.odds import chances as chances_of
 from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, weak_directions
-from jaxreg.scans import candidates, correlation, planes, verdict
+from jaxreg.scans import candidates, correlation, diagnosis, planes, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.free_space import Sides, contradiction
 from jaxreg.scans.known import Known, turns_about
@@ -126,7 +126,9 @@ def registered(
     reason = ""
     if not success:
         in_front = float(free_space.share_in_front(_stacked([fit.pose]))[0])
-        reason = _reason(judged, accuracy, float(rivals.sum()), in_front)
+        sizes = source.points * source.radius, reference.points * reference.radius
+        units = (f"{told[:1].upper()}{told[1:]}." for told in diagnosis.compared(*sizes))
+        reason = " ".join([_reason(judged, accuracy, float(rivals.sum()), in_front), *units])
     spacing = max(
         float(x.examined.spacing) * source.radius, float(y.examined.spacing) * reference.radius
     )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import export
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
@@ -62,6 +63,9 @@ class Search(NamedTuple):
     poses: RigidTransform
     score: Float[Array, "s"]
     allowed: Bool[Array, "s"]
+
+
+export.register_namedtuple_serialization(Search, serialized_name="jaxreg.Search")
 
 
 class _Problem(NamedTuple):
