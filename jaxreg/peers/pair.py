@@ -50,13 +50,12 @@ def in_dtype(variables: Any, dtype: Any) -> Any:
     """The weights in the precision of the clouds.
 
     Raises:
-      ValueError: `variables` lack their parameters or their statistics.
+      ValueError: `variables` have no parameters.
     """
-    lacking = [kind for kind in ("params", "batch_stats") if kind not in variables]
-    if lacking:
+    if "params" not in variables:  # Statistics may lack: not every network has any.
         raise ValueError(
-            f"variables have no '{lacking[0]}': give both parts, as init_variables and "
-            "jaxreg.load_pretrained return them."
+            "variables have no 'params': give them as init_variables and jaxreg.load_pretrained do, "
+            "parameters and statistics."
         )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), variables)
 

@@ -457,14 +457,13 @@ def instead(first, second, count=6000, **options) -> Member:
     )
 
 
-def x_between(low, high):
-    """Which points lie between two quantiles of their x."""
+def left_of(share):
+    """Which points lie in the first part of their extent along x."""
+    return lambda points: points[:, 0] < points[:, 0].min() + share * np.ptp(points[:, 0])
 
-    def chosen(points):
-        x = points[:, 0]
-        return (x >= np.quantile(x, low)) & (x <= np.quantile(x, high))
 
-    return chosen
+def right_of(share):
+    return lambda points: points[:, 0] > points[:, 0].min() + share * np.ptp(points[:, 0])
 
 
 def third_resized() -> list[np.ndarray]:
@@ -480,8 +479,8 @@ def third_resized() -> list[np.ndarray]:
     ]
 
 
-def larger(scale, name, seed, count=8000, **arguments) -> Member:
-    return pair(family(name, seed), count, noise=0.002, change=scale * np.eye(3), **arguments)
+def larger(scale, name, number, count=8000, **arguments) -> Member:
+    return pair(family(name, number), count, noise=0.002, change=scale * np.eye(3), **arguments)
 
 
 OTHER = {
@@ -490,7 +489,6 @@ OTHER = {
     "mirrored chair of one arm": lambda: pair(one_arm(), 1000, change=MIRROR, noise=0.004),
     "mirrored sofa": lambda: pair(sofa(), 3000, change=MIRROR, noise=0.004),
     "mirrored shoe": lambda: pair(shoe(), 12_000, change=MIRROR, noise=0.004),
-    "mirrored bolt": lambda: pair(bolt(), 8000, change=MIRROR),
     "mirrored house, many": lambda: pair(family("house", 1), 4000, change=MIRROR, entry="many"),
     "car, 3 % larger": lambda: larger(1.03, "car", 2),
     "house of 1,000 points, 8 % smaller": lambda: larger(0.92, "house", 1, 1000),
@@ -505,15 +503,18 @@ OTHER = {
     "shelf, 5 % larger": lambda: larger(1.05, "shelf", 2, 12_000),
     "airplane of 3,000 points, 5 % larger": lambda: larger(1.05, "airplane", 1, 3000),
     "bracket of 1,000 points, 5 % larger": lambda: larger(1.05, "bracket", 3, 1000),
-    "halves of a bracket, 6 % larger": lambda: larger(
-        1.06, "bracket", 3, first=x_between(0, 0.7), second=x_between(0.3, 1)
+    "parts of stairs, 6 % larger": lambda: larger(
+        1.06, "stairs", 1, seed=2, first=left_of(0.7), second=right_of(0.3)
     ),
-    "lamp, 5 % larger": lambda: larger(1.05, "lamp", 1, 12_000),
+    "parts of a chair, 6 % larger": lambda: larger(
+        1.06, "chair", 3, seed=2, first=left_of(0.7), second=right_of(0.3)
+    ),
+    "lamp, 5 % larger": lambda: larger(1.05, "lamp", 1, 3000),
     "mirrored floor": lambda: planar(
         walls(draw(1), FLOOR, 15) * [1, -1], walls(draw(2), FLOOR, 15), degrees=60
     ),
-    "floor, 3 % larger": lambda: planar(
-        1.03 * walls(draw(1), FLOOR, 15), walls(draw(2), FLOOR, 15), degrees=60
+    "floor, 2 % larger": lambda: planar(
+        1.02 * walls(draw(2), FLOOR, 15), walls(draw(11), FLOOR, 15), degrees=60
     ),
     "chair in a scene, 8 % smaller": lambda: in_a_scene("chair", 1.08, known="inside"),
 }
@@ -525,12 +526,15 @@ OTHER_WRONG = {
     "shelf, 5 % larger": "success, p = 0.99; a fifth of the points lie 8 noise levels off",
     "airplane of 3,000 points, 5 % larger": "success, p = 0.98; a third lies 8 noise levels off",
     "bracket of 1,000 points, 5 % larger": "success, p = 0.97; a quarter lies 8 noise levels off",
-    "halves of a bracket, 6 % larger": "success, p = 0.84, and 6.6 degrees off",
-    "lamp, 5 % larger": "success, upside down: fitness 0.4, the foot on the foot",
+    "parts of stairs, 6 % larger": "success, p = 0.84: 4 times as far off as is allowed",
+    "parts of a chair, 6 % larger": "success, p = 0.98, turned by 90 degrees",
+    "lamp, 5 % larger": "success, p = 0.95, upside down: fitness 0.4, the foot on the foot",
     "mirrored floor": "success, p = 1.00; a fifth of the points lie 8 noise levels off",
-    "floor, 3 % larger": "success, p = 1.00; 70 % of the points lie 8 noise levels off",
+    "floor, 2 % larger": "success, p = 1.00; 60 % of the points lie 8 noise levels off",
     "chair in a scene, 8 % smaller": "success, p = 0.97",
 }
+
+SLOW_OTHER = ("chair in a scene, 8 % smaller",)
 
 NEIGHBOURS = {
     "bolt": lambda: pair(bolt(), 8000, noise=0.01),
@@ -538,12 +542,12 @@ NEIGHBOURS = {
     "fluted column": lambda: pair(column(), 8000),
     "gear with a key": lambda: pair(family("gear", 3), 8000, noise=0.005),
     "fruit": lambda: fruit(0.2, 4000, 0),
-    "fruit, nearly a sphere": lambda: fruit(0.03, 4000, 1),
-    "fruit, nearly a sphere, of 12,000 points": lambda: fruit(0.03, 12_000, 3),
+    "fruit, nearly a sphere": lambda: fruit(0.05, 4000, 7),
+    "fruit, nearly a sphere, of 8,000 points": lambda: fruit(0.03, 8000, 6),
 }
 NEIGHBOURS_WRONG = {
-    "fruit, nearly a sphere": "success, p = 1.00, 5.7 degrees off, 30 times the sigma",
-    "fruit, nearly a sphere, of 12,000 points": "success, p = 0.93, 5.6 degrees off, 50 times sigma",
+    "fruit, nearly a sphere": "success, p = 1.00, 5.8 degrees off, 30 times the sigma",
+    "fruit, nearly a sphere, of 8,000 points": "success, p = 1.00, 5.9 degrees, 40 times the sigma",
 }
 
 
@@ -624,7 +628,6 @@ STARTS = {
     "road, one iteration": lambda: nudged(road, iterations=1),
     "tunnel, point to point": lambda: nudged(tunnel, "icp"),
     "corridor, point to point": lambda: nudged(corridor, "icp"),
-    "dune, point to point": lambda: nudged(dune, "icp"),
     "relief, one iteration": lambda: nudged(relief, iterations=1),
 }
 STARTS_WRONG = {
@@ -632,7 +635,7 @@ STARTS_WRONG = {
     "road, one iteration": "success, p = 1.00, converged, 1.4 m off",
     "tunnel, point to point": "success, p = 1.00, converged, 0.41 m off, sigma 8 mm",
     "corridor, point to point": "success, p = 1.00, converged, 0.39 m off, sigma 35 mm",
-    "dune, point to point": "success, p = 1.00, converged, 0.41 m off, and goes on when run again",
+    "tunnel": "success, p = 1.00, 1.0 degrees off, 14 times the sigma",
     "relief, one iteration": "success, p = 1.00, converged, 2.1 degrees and 0.19 m off",
 }
 
@@ -886,10 +889,10 @@ SYMMETRIC = {
     "two chairs in a scene": lambda: twice("chair", known="inside"),
     "copy of a lattice, body centred": lambda: copied(lattice("bcc", (8, 8, 8))),
     "copy of a lattice, face centred": lambda: copied(lattice("fcc", (6, 6, 6))),
-    "copy of a lattice, diamond": lambda: copied(lattice("diamond", (8, 8, 8))),
+    "copy of a lattice, diamond": lambda: copied(lattice("diamond", (7, 7, 7))),
     "sphere from a start": lambda: revolved("sphere", initial=np.eye(4)),
     "vase from a start": lambda: revolved("vase", initial=np.eye(4)),
-    "cone, limited": lambda: revolved("cone", 10_000, max_rotation_deg=10),
+    "vase, limited": lambda: revolved("vase", max_rotation_deg=10),
     "sphere, limited": lambda: revolved("sphere", max_rotation_deg=10),
     "pipe, upright, from a start": lambda: revolved("pipe", initial=np.eye(4), known="upright"),
     "stairs of equal steps": lambda: pair(
@@ -901,7 +904,7 @@ SYMMETRIC = {
     "box in a scene": lambda: of_a_scene(box((0.5, 0.3, 0.2), (0, 0, 0.15)), known="inside"),
     "two brackets in a scene": lambda: twice("bracket"),
     "patch of a plane in a scene": lambda: of_a_scene(
-        box((1, 1, 0.001), (0, 0, 0.05)), known="inside", rotation=yaw(70)
+        box((1.2, 0.7, 0.001), (0, 0, 0.05)), known="inside", rotation=yaw(140)
     ),
     "brick at another size": lambda: estimated(pair(BRICK, 2000, noise=0.003), 2.0),
     "prism of five sides at another size": lambda: estimated(
@@ -922,23 +925,28 @@ SYMMETRIC = {
 FREE = "success, p = 1.00, though it turns freely; 8 to 18 degrees off, sigma below 1 degree"
 ALONE = "success, p = 1.00, without alternatives: the last pose of scale=True has no rivals"
 SYMMETRIC_WRONG = {
-    "copy of a lattice, diamond": "success, p = 1.00, 120 degrees and a third of a cell off",
+    "copy of a lattice, diamond": "success, p = 1.00, alone: a third of a turn is as good",
     "sphere from a start": FREE,
     "vase from a start": FREE,
-    "cone, limited": FREE,
+    "vase, limited": FREE,
     "sphere, limited": FREE,
     "pipe, upright, from a start": FREE,
     "stairs of equal steps": "success, p = 0.99, without alternatives: half a turn is as good",
     "sleepers": "success, p = 0.92: half a turn is as good",
     "box in a scene": "success, p = 1.00, without alternatives: half turns are as good",
     "two brackets in a scene": "success, p = 0.83, without alternatives: the other is as good",
-    "patch of a plane in a scene": "success, p = 0.97, 1.1 m off: it may be slid anywhere",
+    "patch of a plane in a scene": "success, p = 1.00, alone, metres off: it may be slid anywhere",
     "brick at another size": ALONE,
     "prism of five sides at another size": ALONE,
     "stool at another size": ALONE,
     "pentagon in the plane at another size": ALONE,
 }
-SLOW_SYMMETRIC = ("pentagon in the plane at another size",)
+SLOW_SYMMETRIC = (
+    "box in a scene",
+    "two chairs in a scene",
+    "stool at another size",
+    "pentagon in the plane at another size",
+)
 
 REPEATING = {
     "stairs, upright": lambda: pair(
@@ -1012,9 +1020,9 @@ def map_and_submap(*, first: bool, entry="many") -> Member:
     """A ball of a room in two rooms; `first`: the small one comes first."""
     small, large = _submap()
     if first:
-        back = turn(2).T
-        return Member(moved(large, turn(2), SHIFT), small, back, -back @ SHIFT, {}, entry)
-    return Member(small, moved(large, turn(2), SHIFT), turn(2), SHIFT, {}, entry)
+        back = turn(3).T
+        return Member(moved(large, turn(3), SHIFT), small, back, -back @ SHIFT, {}, entry)
+    return Member(small, moved(large, turn(3), SHIFT), turn(3), SHIFT, {}, entry)
 
 
 @functools.cache
@@ -1030,26 +1038,33 @@ INSIDE = {
     "room in a building, known": lambda: of_a_building(4, in_room, known="inside"),
     "room in a building, upright": lambda: of_a_building(1, in_room, known=("inside", "upright")),
     "room in a building, from a start": lambda: of_a_building(1, in_room, start=True),
-    "ball of 2 m in a building": lambda: of_a_building(3, in_ball),
+    "ball of 2 m in a building, known": lambda: of_a_building(2, in_ball, known="inside"),
     "the large one as the source": lambda: of_a_building(1, in_room, swapped=True),
     "face of 35 degrees": lambda: face(35),
     "face of 50 degrees, known": lambda: face(50, known="inside"),
-    "car on a table": lambda: in_a_scene("car", known="inside"),
+    "car on a table": lambda: in_a_scene("car"),
+    "car on a table, known": lambda: in_a_scene("car", known="inside"),
     "map, then submap": lambda: map_and_submap(first=False),
     "shell": lambda: map_and_submap(first=False, entry="shell")._replace(
         options={"shell": ("--known", "inside")}
     ),
+    "another ball of 2 m in a building, known": lambda: of_a_building(1, in_ball, known="inside"),
+    "map on a submap": lambda: map_and_submap(first=True, entry="register"),
     "submap, then map": lambda: map_and_submap(first=True),
 }
 INSIDE_WRONG = {
+    "car on a table, known": "refused, turned by 180 degrees; right and p = 0.98 if nothing is known",
+    "another ball of 2 m in a building, known": "success, p = 0.81, 21 degrees off",
+    "map on a submap": "success, p = 1.00, 56 degrees off; the other way round it is right",
     "submap, then map": "refused, though the same two scans in the other order are placed",
 }
-SLOW_INSIDE = ("car on a table", "submap, then map")
+SLOW_INSIDE = (
+    "car on a table, known",
+    "submap, then map",
+    "another ball of 2 m in a building, known",
+)
 
 ABSENT = {
-    "bracket": lambda: in_a_scene("bracket", known="inside")._replace(
-        source=sample(draw(2), resting("chair"), 3000)
-    ),
     "chair": lambda: in_a_scene("car")._replace(source=sample(draw(2), resting("chair"), 3000)),
 }
 
@@ -1113,7 +1128,7 @@ SQUARE = np.column_stack([ngon(4, 10), np.zeros(4)])
 KITE = np.array([[0.0, 0, 0], [4, 3, 0], [10, 0, 0], [4, -3, 0]])
 TRAPEZOID = np.array([[0.0, 0, 0], [10, 0, 0], [8, 5, 0], [2, 5, 0]])
 TETRAHEDRON = 5 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-RASTER = 5 * np.stack(np.meshgrid(np.arange(4.0), np.arange(5.0), [0.0]), axis=-1).reshape(-1, 3)
+RASTER = 5 * np.stack(np.meshgrid(np.arange(3.0), np.arange(5.0), [0.0]), axis=-1).reshape(-1, 3)
 PATTERNS = {
     "pentagon": (np.column_stack([ngon(5, 10), np.zeros(5)]), {}, 10),
     "hexagon": (np.column_stack([ngon(6, 10), np.zeros(6)]), {}, 12),
@@ -1140,7 +1155,6 @@ def swapped_columns(entry="register") -> Member:
 
 
 UNLIKE = {
-    "5 unrelated": lambda: targets(draw(1), 5)._replace(source=draw(7).uniform(0, 40, (5, 3))),
     "12 unrelated": lambda: targets(draw(1), 12)._replace(source=draw(7).uniform(0, 40, (12, 3))),
     "40 unrelated": lambda: targets(draw(1), 40)._replace(source=draw(7).uniform(0, 40, (40, 3))),
     "30 mirrored in the plane": lambda: stems(draw(1), 30, mirrored=True),
@@ -1310,13 +1324,13 @@ ALIKE = {
         (2, 7), (28, 7), viewpoint=((0, 0), (5, -3))
     ),
     "offices": lambda: scanned_twice((15, 7), (22, 3)),
-    "office on the plan": lambda: on_the_plan((22, 3)),
+    "an office and the corridor": lambda: scanned_twice((22, 3), (26, 7)),
 }
 ALIKE_WRONG = {
     "ends of a corridor": "success, p = 0.99: turned by 180 degrees, 24 m off",
     "ends of a corridor, from where": "success, p = 0.99: turned by 180 degrees, 24 m off",
     "offices": "success, p = 0.95, 10 m off",
-    "office on the plan": "success, p = 0.71: turned by 180 degrees, 7.5 m off",
+    "an office and the corridor": "success, p = 0.91: turned by 90 degrees, 8 m off",
 }
 
 
@@ -1449,7 +1463,7 @@ def test_strays_decide_nothing_and_are_told(make, tmp_path):
     assert_right(answer(member, tmp_path), member, angle=0.5)
 
 
-@cases(OTHER, OTHER_WRONG)
+@cases(OTHER, OTHER_WRONG, SLOW_OTHER)
 def test_mirror_images_and_other_sizes_and_objects_are_no_success(make, tmp_path):
     assert not answer(make(), tmp_path).success
 
@@ -1528,7 +1542,7 @@ def test_patterns_have_as_many_poses_as_turns_map_them_to_themselves(make):
     assert found.success == (turns == 1)
 
 
-@cases(UNLIKE, UNLIKE_WRONG)
+@cases(UNLIKE, UNLIKE_WRONG, ("40 unrelated",))
 def test_targets_of_something_else_are_no_success(make, tmp_path):
     assert not answer(make(), tmp_path).success
 
