@@ -10,11 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxreg.config import FMRConfig, IDAMConfig, RPMNetConfig
+from jaxreg.data.procedural.shapes import sample_shape
 from jaxreg.evaluation import methods
-from jaxreg.peers import fmr, idam, rpmnet
+from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.peers import by_name, fmr, idam, rpmnet
 from jaxreg.types import PointCloud
+from jaxreg.weights.released import load_pretrained
 
 pytestmark = pytest.mark.loose
 
@@ -207,6 +211,17 @@ def test_names_of_data_parallel_are_the_same(method, saved, tmp_path):
     found = MODULES[method].load_weights(tmp_path / "wrapped.npz")
     jax.tree.map(np.testing.assert_array_equal, plain[0], found[0])
     assert plain[1] == found[1]
+
+
+@pytest.mark.parametrize("method", MODULES)
+def test_released_weights_find_the_pose_of_a_copy(method):
+    """As they are loaded: a network without statistics has none in its file."""
+    variables, config = load_pretrained(method)
+    source = jnp.asarray(sample_shape(5, 9, points=512))
+    turn = jnp.asarray(Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix(), source.dtype)
+    found = by_name.register(variables, source, source @ turn.T + 0.1, config=config)
+    assert found.valid
+    assert rotation_angle_deg(np.asarray(found.rotation), np.asarray(turn)) < 10
 
 
 @pytest.mark.parametrize("method", MODULES)
