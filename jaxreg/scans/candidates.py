@@ -182,8 +182,15 @@ def with_half_turns(
     evidence, score = clouds.judge(turned)
     # Where as many points coincide, the rest of the evidence is chance: the points lie on no surface.
     score = np.where(evidence.same >= _AS_MANY * evidence.same[0], np.max(score), score)
-    found = list(zip(map(RigidTransform, *turned), score.tolist(), strict=True))
-    found = [(pose, np.inf), *others, *found[1:]]
+    found = zip(map(RigidTransform, *turned), score.tolist(), strict=True)
+    return distinct_from(pose, (*others, *list(found)[1:]))
+
+
+def distinct_from(
+    pose: RigidTransform, others: tuple[tuple[RigidTransform, float], ...]
+) -> tuple[tuple[RigidTransform, float], ...]:
+    """Those of other poses and their log odds that differ from `pose` and each other, best first."""
+    found = [(pose, np.inf), *others]
     stacked = RigidTransform(*map(np.stack, zip(*(one for one, _ in found), strict=True)))
     distinct = _distinct(stacked, np.array([score for _, score in found]), len(found))
     return tuple(found[i] for i in distinct[1:])

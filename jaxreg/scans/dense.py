@@ -7,18 +7,20 @@ stretched or sheared, or mirrored? Where a large share of all points lies off wi
 surfaces are of different shapes.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxreg.scans import planes
+from jaxreg.geometry import se3
+from jaxreg.scans import planes, stable
 from jaxreg.scans.prepare import Prepared
 from jaxreg.types import RigidTransform
 
 _GLANCE, _SAMPLE = 500, 4000
 """Points of the source that are compared: at first, and where these are suspicious."""
-_OFF = 8.0
+OFF = 8.0
 """A point this many noise levels from the other surface is off it."""
 _LEAST = 0.02
 """The noise is at least so many widths of a patch where the typical distance is looked at."""
@@ -36,7 +38,21 @@ _MOST = 0.25
 """And the largest difference: a thin part fits anywhere where it may be pressed flat."""
 _DIFFERENT = 0.2
 """Another shape, whatever the cause, if nearly all points can be compared and so many are off."""
+_SLIGHTLY = 0.02
+"""A difference of size that is told where only the fit says so: parts of one drawing differ by less."""
+_HINT = 0.5
+"""A first step that says so much of it is reason enough to fit the size."""
+_SHOWN, _SIZED = 500, 2000
+"""Points of the first step, and of the fit."""
+_STARTS = 0.96, 1.0, 1.04
+"""Sizes to fit from: under a pose that has settled between the two surfaces, 1 is a minimum, too."""
+_NARROWING = 8
+_LIMIT, _FIRST_WIDTH = 8.0, 40.0
+"""Noise levels from which a point counts in full against a size, and where the first kernel ends."""
+_CLEARLY = 3.0
+"""Standard errors by which the fit at another size is better (docs/notes/0065)."""
 _ITERATIONS = 30
+MIRRORED = "The mirrored source fits better."
 _WIDEST = 3.0
 """Where the kernel ends, in the distances that it is to judge."""
 _STIFF = 1e-6
@@ -55,14 +71,19 @@ class Agreement(NamedTuple):
     spread: float
 
     @property
+    def comparable(self) -> bool:
+        """Whether nearly all points lie over the other surface."""
+        return self.compared >= _ENOUGH
+
+    @property
     def suspicious(self) -> bool:
         """Whether one should ask why."""
-        return self.compared >= _ENOUGH and self.off >= _SUSPECT
+        return self.comparable and self.off >= _SUSPECT
 
     @property
     def drawn(self) -> bool:
         """Whether nothing fits to the noise, as where a part that moved drew the pose along."""
-        return self.compared >= _ENOUGH and self.spread >= _SPREAD
+        return self.comparable and self.spread >= _SPREAD
 
     @property
     def different(self) -> bool:
@@ -70,8 +91,10 @@ class Agreement(NamedTuple):
         return self.compared >= 0.9 and self.off >= _DIFFERENT
 
     def explains(self, other: "Agreement") -> bool:
-        """Whether this is a far better fit than the other."""
-        return self.compared >= 0.9 * other.compared and self.off <= _BETTER * other.off
+        """Whether this is a far better fit than the other, to the noise or nearer to it."""
+        to_the_noise = self.spread <= max(other.spread, _SPREAD)
+        fewer_off = self.off <= _BETTER * other.off
+        return self.compared >= 0.9 * other.compared and fewer_off and to_the_noise
 
 
 def agreement(
@@ -99,7 +122,7 @@ def agreement(
         return Agreement(0.0, 0.0, 0.0)
     off, noise, floored = np.abs(off[over]), noise[over], floored[over]
     spread = float(np.median(off / np.maximum(noise, _LEAST * typical)))
-    return Agreement(float(over.mean()), float(np.mean(off > _OFF * floored)), spread)
+    return Agreement(float(over.mean()), float(np.mean(off > OFF * floored)), spread)
 
 
 def at_a_glance(source: Prepared, reference: Prepared, pose: RigidTransform) -> Agreement:
@@ -132,6 +155,28 @@ def at_another_size(
     return found.scale, agreement(source, reference, pose, found.scale * np.eye(3))
 
 
+def slight_size(
+    source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
+) -> float | None:
+    """The scale at which the source fits better, where that is a few per cent; else None.
+
+    The pose of a part and one that is a little larger settles where both agree about as well
+    everywhere, so that few points are off by much, and of 1,000 points none. A fit of seven unknowns
+    tells, from several sizes and both ways: the plane through points of a thin or curved part lies
+    inside it, which makes the moving cloud too small, and the two errors cancel.
+    `reach` is the largest distance of corresponding points.
+    """
+    ways = ((source, reference, pose), (reference, source, se3.inverted(pose)))
+    hint, back = (_step_of_size(*way) for way in ways)
+    if abs(hint - back) / 2 < _HINT * _SLIGHTLY:
+        return None
+    (scale, better), (inverse, back_better) = (_sized(*way, reach) for way in ways)
+    scale = math.sqrt(scale / inverse)
+    if abs(math.log(scale)) < _SLIGHTLY or max(better, back_better) < _CLEARLY:
+        return None
+    return scale
+
+
 def stretched(
     source: Prepared, reference: Prepared, pose: RigidTransform, reach: float
 ) -> tuple[Float[np.ndarray, "3"], Agreement]:
@@ -162,6 +207,11 @@ def stretched(
     return sizes, agreement(source, reference, pose, right.T @ np.diag(sizes) @ right)
 
 
+def slight_size_text(scale: float) -> str:
+    """A sentence on the size that `slight_size` found."""
+    return f"The source fits at {scale:.3f} of its size."
+
+
 def size_text(scale: float, now: Agreement, then: Agreement) -> str:
     """A sentence on the size at which the source fits; empty if it is its own."""
     if abs(np.log(scale)) < _SIZES or not then.explains(now):
@@ -186,8 +236,44 @@ def different_text(now: Agreement) -> str:
         return ""
     return (
         f"{now.off:.0%} of the points lie over the other surface and off it by more than "
-        f"{_OFF:.0f} times the noise: it is of another shape."
+        f"{OFF:.0f} times the noise: it is of another shape."
     )
+
+
+def _in_radii(
+    moving: Prepared, fixed: Prepared, pose: RigidTransform, count: int
+) -> tuple[Float[np.ndarray, "p 3"], RigidTransform, float]:
+    """Points of a cloud, a pose of centred clouds, and the noise, in radii of the fixed cloud."""
+    rows = np.linspace(0, len(moving.points) - 1, min(count, len(moving.points))).astype(int)
+    some = moving.points[rows] * (moving.radius / fixed.radius)
+    shift = pose.translation / fixed.radius
+    return some, RigidTransform(pose.rotation, shift), stable.noise(moving, fixed, _SHOWN)[0]
+
+
+def _step_of_size(moving: Prepared, fixed: Prepared, pose: RigidTransform) -> float:
+    """The logarithm of the scale after one Gauss-Newton step of seven unknowns."""
+    some, pose, noise = _in_radii(moving, fixed, pose, _SHOWN)
+    width = np.array([_FIRST_WIDTH * noise])
+    found = planes.fitted(some, fixed.surface, pose, width, motions=np.eye(6), scale=1.0)
+    return math.log(found.scale)
+
+
+def _sized(
+    moving: Prepared, fixed: Prepared, pose: RigidTransform, reach: float
+) -> tuple[float, float]:
+    """The scale at which a cloud fits best, and by how many standard errors it is better there."""
+    some, pose, noise = _in_radii(moving, fixed, pose, _SIZED)
+    limit = np.array([_LIMIT * noise])
+    widths = np.geomspace(max(reach / fixed.radius, _LIMIT * noise), 5 * noise, _NARROWING)
+    now = planes.misfit(some @ pose.rotation.T + pose.translation, fixed.surface, limit)
+    scale, better = 1.0, -np.inf
+    for start in _STARTS:
+        found = planes.fitted(some, fixed.surface, pose, widths, motions=np.eye(6), scale=start)
+        moved = found.scale * some @ found.pose.rotation.T + found.pose.translation
+        errors = -float(planes.errors_worse(planes.misfit(moved, fixed.surface, limit), now)[0])
+        if errors > better:
+            scale, better = found.scale, errors
+    return scale, better
 
 
 def _widths(noise: Float[np.ndarray, "p"], reach: float) -> Float[np.ndarray, "i"]:

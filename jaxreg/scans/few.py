@@ -4,6 +4,7 @@ They show no surface. The poses come from all triples (`jaxreg.scans.triples`); 
 residual are the evidence, and two poses that agree equally well are no success.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -13,7 +14,8 @@ from jaxreg.geometry import se3
 from jaxreg.judge.odds import chances as chances_of
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import triples
-from jaxreg.scans.known import Known
+from jaxreg.scans.dense import MIRRORED
+from jaxreg.scans.known import UP, Known
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import (
     LISTED,
@@ -36,6 +38,8 @@ _TRUSTED, _RIVAL = 0.5, 0.1
 """The probability of a success, and that of all other poses which forbids one."""
 _FREE = 0.1
 """Standard deviation of the rotation, in radians, from which the points leave it free."""
+_FLAT = 1e-9
+"""Clouds less thick than this are in a plane of one z, in which a turn is about z."""
 _REACH = 3.0
 """Points within so many residuals of another count as the same."""
 
@@ -56,29 +60,35 @@ def registered(
     # Squares of lengths of any unit might not be finite.
     unit = max(source.radius, reference.radius)
     x, y = (cloud.points * (cloud.radius / unit) for cloud in clouds)
-    found = triples.solutions(
-        x, y, up=known.up, max_rotation_deg=known.max_rotation_deg,
+    if all(np.ptp(points[:, 2]) <= _FLAT for points in (x, y)):
+        known = known._replace(up=UP)
+    solved = functools.partial(
+        triples.solutions, up=known.up, max_rotation_deg=known.max_rotation_deg,
         initial=None if start is None else in_unit(centred(clouds, start), 1 / unit),
     )  # fmt: skip
+    found = solved(x, y)
     if not found or found[0].log_odds <= 0:
         return None
     best = found[0]
+    mirrored = solved(x * [-1, 1, 1], y) if len(best.pairs) < min(len(x), len(y)) else []
+    mirrored = bool(mirrored) and mirrored[0].log_odds > best.log_odds
     chances = chances_of(np.array([one.log_odds for one in found]))
     accuracy = _accuracy(x, best, known, reference.centre, unit)
     free = bool(accuracy.weak_directions)
-    chance = 0.0 if free else float(chances[0])
+    chance = 0.0 if free or mirrored else float(chances[0])
     alone = float(chances[1:].sum()) < _RIVAL
     success = chance >= _TRUSTED and alone
     evidence = FewEvidence(
         len(best.pairs), min(len(x), len(y)), unit * best.residual, best.log_chance / math.log(10)
     )
+    reason = MIRRORED if mirrored else _reason(evidence, free, alone)
     distance = _REACH * max(best.residual, triples.EXACT * float(np.ptp(y, axis=0).max()))
     moved = x @ best.pose.rotation.T + best.pose.translation
     shared = 2 * np.sum(np.linalg.norm(moved[:, None] - y, axis=2).min(axis=1) <= distance)
     return assembled(
         clouds,
         in_unit(best.pose, unit),
-        Verdict(success, chance, "" if success else _reason(evidence, free, alone), evidence),
+        Verdict(success, chance, "" if success else reason, evidence),
         accuracy,
         distance=unit * distance,
         overlap=float(min(shared / (len(x) + len(y)), 1.0)),

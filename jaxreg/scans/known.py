@@ -14,6 +14,8 @@ from jaxreg.types import RigidTransform
 Fact = Literal["upright", "inside"]
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _ROUNDING_DEG = 1e-6
+UP = np.array(_AXES["z"])
+"""What clouds in a plane of one z are turned about."""
 
 
 class Known(NamedTuple):
@@ -35,6 +37,20 @@ class Known(NamedTuple):
         if self.up is None:
             return basis
         return np.column_stack([np.concatenate([self.up, np.zeros(3)]), basis[:, 3:]])
+
+    def in_the_plane(self) -> "Known":
+        """The same of clouds of one z, which are turned about z alone.
+
+        Raises:
+          ValueError: another axis is known to be upright.
+        """
+        if self.up is not None and abs(self.up @ UP) < 1 - _ROUNDING_DEG:
+            raise ValueError(
+                f"up is ({', '.join(f'{value:.3g}' for value in self.up)}), but both clouds lie in a "
+                "plane of one z, where a turn is about z: leave known='upright' out, or give three "
+                "coordinates."
+            )
+        return self._replace(up=UP)
 
     def conditional(self, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
         """The covariance of a pose whose other motions are known: ``B (B^T C^-1 B)^-1 B^T``."""

@@ -131,7 +131,7 @@ def register_prepared(
     """
     known = known or Known(max_rotation_deg=max_rotation_deg or 180.0)
     if flat := planar.is_planar(source, reference):
-        known = known._replace(up=planar.UP)
+        known = known.in_the_plane()
     if not scale:
         found = _of_one_size(source, reference, config, start, known, least, thorough)
         return _within_limit(found, known)

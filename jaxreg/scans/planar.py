@@ -18,11 +18,11 @@ from jaxreg.judge.evidence import REACH, Evidence
 from jaxreg.judge.odds import chances as chances_of
 from jaxreg.judge.surface import Examined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, weak_directions
-from jaxreg.scans import candidates, correlation, diagnosis, planes, verdict
+from jaxreg.scans import candidates, correlation, dense, diagnosis, planes, prepare, verdict
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.free_space import Sides, contradiction
-from jaxreg.scans.known import Known, turns_about
-from jaxreg.scans.prepare import Prepared, reduce_to
+from jaxreg.scans.known import UP, Known, turns_about
+from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import (
     LISTED,
     Accuracy,
@@ -36,7 +36,6 @@ from jaxreg.scans.result import (
 )
 from jaxreg.types import RigidTransform
 
-UP = np.array([0.0, 0.0, 1.0])
 MOTIONS = np.eye(6)[:, [2, 3, 4]]
 """The unknown ones: the turn in the plane and two shifts."""
 _FLAT = 1e-9
@@ -55,6 +54,11 @@ _NARROWING, _STEADY = 10, 6
 """Iterations while the kernel narrows, and at the end."""
 _START = 0.15
 """How far off points may lie under a pose that is given, in radii."""
+_COMPARED, _SUSPECT = 0.5, 0.05
+"""If so many points lie beside the other line and so many of these off it, one asks why."""
+_OTHER, _MOSTLY_OFF = 0.12, 0.3
+"""Another shape or place, if so many are off, of nearly all points and of fewer. Plans, lidar and
+leaves under the right pose have at most 0.02, a coast of which a third is missing 0.12."""
 _STILL = 1e-4
 """A pose stands still if the last step turns by less (radians) and moves by less (radii)."""
 _ENDS = 2.0
@@ -119,8 +123,10 @@ def registered(
         weights = weights[trees.nearest(source.tree, source.fine.points)[1]]
     fit = _closed(x, y, ratio, pose, config, weights)
     accuracy = _accuracy(fit, reference, config)
-    free = bool(accuracy.weak_directions)
-    chance = 0.0 if free else float(chances[0])
+    cause = ""
+    if config.refine is not None and weights is None:
+        cause = _cause(source, x, y, ratio, fit, config, known)
+    chance = 0.0 if cause or accuracy.weak_directions else float(chances[0])
     rivals = chances[1:]
     success = verdict.is_success(chance, rivals, accuracy.converged)
     reason = ""
@@ -128,7 +134,8 @@ def registered(
         in_front = float(free_space.share_in_front(_stacked([fit.pose]))[0])
         sizes = source.points * source.radius, reference.points * reference.radius
         units = (f"{told[:1].upper()}{told[1:]}." for told in diagnosis.compared(*sizes))
-        reason = " ".join([_reason(judged, accuracy, float(rivals.sum()), in_front), *units])
+        cause = cause or _reason(judged, accuracy, float(rivals.sum()), in_front)
+        reason = " ".join([cause, *units])
     spacing = max(
         float(x.examined.spacing) * source.radius, float(y.examined.spacing) * reference.radius
     )
@@ -154,7 +161,7 @@ def _line(cloud: Prepared) -> Line:
     surface = planes.Surface(points, tree, count=_NEIGHBORS, flat=True)
     normals = cloud.fine.normals
     normals = surface.next_to(points).normal if normals is None else normals
-    judged = reduce_to(points, _JUDGED)
+    judged = prepare.reduce_to(points, _JUDGED)
     noise = planes.patches(points, tree, judged, count=_NEIGHBORS, flat=True).noise
     judged_tree = trees.Tree(judged)
     examined = _examined(judged, judged_tree, cloud)
@@ -278,6 +285,48 @@ def _held(points: np.ndarray, normals: np.ndarray, near: np.ndarray) -> float:
     rows = np.column_stack([np.cross(at / radius, across)[:, 2], across[:, :2]])
     values = np.linalg.eigvalsh(rows.T @ rows / len(at))
     return 8 / 15 * 3 / float(np.sum(1 / (np.maximum(values, 0) + 1e-6))) - 1e-7
+
+
+def _cause(
+    source: Prepared,
+    x: Line,
+    y: Line,
+    ratio: float,
+    fit: planes.Fitted,
+    config: RegisterConfig,
+    known: Known,
+) -> str:
+    """A sentence where many points lie off the other line: another size, a mirror image, or a doubt."""
+    now = _agreement(x, y, ratio, fit)
+    if now.compared < _COMPARED or now.off < _SUSPECT:
+        return ""
+    widths = np.geomspace(_START, planes.TUKEY * max(_noise(x, y, ratio), 1e-6), _NARROWING)
+    sized = planes.fitted(x.points * ratio, y.surface, fit.pose, widths, motions=MOTIONS, scale=1.0)
+    if told := dense.size_text(sized.scale, now, _agreement(x, y, ratio, sized)):
+        return told
+    points = source.points * source.radius * [-1, 1, 1]
+    twin = _line(prepare.prepare(points, config=config))
+    for other in _searched(twin, y, ratio, config, known):
+        closed = _closed(twin, y, ratio, other.pose, config, None)
+        if _agreement(twin, y, ratio, closed).explains(now):
+            return dense.MIRRORED
+    if now.off < (_OTHER if now.comparable else _MOSTLY_OFF):
+        return ""
+    return (
+        f"{now.off:.0%} of the points lie beside the other line and off it by more than "
+        f"{dense.OFF:.0f} times the noise: it is another shape, or another place."
+    )
+
+
+def _agreement(x: Line, y: Line, ratio: float, fit: planes.Fitted) -> dense.Agreement:
+    """How many of the points of a line lie beside the other, and how many of them off it."""
+    patches = y.surface.next_to(y.points)
+    noise = max(_noise(x, y, ratio), planes.FLOOR * float(np.median(patches.width)), 1e-12)
+    off = np.abs(fit.off[fit.over])
+    if not len(off):
+        return dense.Agreement(0.0, 0.0, 0.0)
+    share = float(np.mean(off > dense.OFF * noise))
+    return dense.Agreement(float(fit.over.mean()), share, float(np.median(off)) / noise)
 
 
 def _accuracy(fit: planes.Fitted, reference: Prepared, config: RegisterConfig) -> Accuracy:

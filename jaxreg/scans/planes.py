@@ -129,6 +129,29 @@ def offsets(
     return off, np.linalg.norm(residual - off[:, None] * found.normal, axis=1)
 
 
+def misfit(
+    points: Float[np.ndarray, "p 3"], surface: Surface, limits: Float[np.ndarray, "l"]
+) -> Float[np.ndarray, "l p"]:
+    """How much every point speaks against lying on a surface, from 0 to 1, for each of the limits.
+
+    The squared distance from the plane of its patch in units of the limit, 1 from there on and where
+    there is no patch beside it.
+    """
+    found = surface.next_to(points)
+    off, beside = offsets(points, found)
+    off = np.where(beside < WITHIN * found.width, np.abs(off), np.inf)
+    return np.minimum(off / limits[:, None], 1) ** 2
+
+
+def errors_worse(
+    other: Float[np.ndarray, "l p"], one: Float[np.ndarray, "l p"]
+) -> Float[np.ndarray, "l"]:
+    """The mean difference of two misfits of the same points, in standard errors."""
+    difference = other - one
+    deviation = difference.std(axis=1) / np.sqrt(difference.shape[1])
+    return difference.mean(axis=1) / np.maximum(deviation, 1e-12)
+
+
 def fitted(
     source: Float[np.ndarray, "p 3"],
     reference: Surface,

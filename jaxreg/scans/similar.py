@@ -53,7 +53,11 @@ def registered(
     for _ in range(_ROUNDS):
         change, pose, sigma = _fitted((resized(source, size), reference), pose, known, flat)
         size *= change
-    found = run(resized(source, size), reference, config, pose, known)
+    sized = resized(source, size)
+    found = run(sized, reference, config, None if start is None else pose, known)
+    if start is None and not found.success and not found.alternatives:
+        # What the search of that size does not find again stands as it was fitted.
+        found = run(sized, reference, config, pose, known)
     return dataclasses.replace(
         found,
         transformation=matrix_of(RigidTransform(size * found.rotation, found.translation)),

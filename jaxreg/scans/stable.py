@@ -32,6 +32,8 @@ _STAYED, _MOVED = 1.25, 2.0
 _GAIN = 1.02
 """A pose is taken if so many times as many points agree with it: lie within one noise level. Within
 three a pose that was drawn along a little agrees about as well as the right one."""
+_MORE = 1.2
+"""And the pose of a half, if so many times as many points are within the noise as under that of all."""
 _MAJORITY = 0.6
 """A pose that rests on a smaller share than this is no success: what moved, and what stayed?"""
 _LEAST = 1e-9
@@ -88,27 +90,25 @@ def settled(
     few, many = _rows(source, _FIRST), _rows(source, _SECOND)
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
     given = np.ones(len(source.points)) if known.weights is None else known.weights
-    noise, least = _noise(source, reference)
-    widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
-    found = planes.fitted(
-        first, reference.surface, start, widths, motions=motions, weights=given[few]
-    )
+    level, least = noise(source, reference)
+    widths = np.geomspace(max(reach / unit, planes.TUKEY * level), planes.TUKEY * level, _NARROWING)
+    found = _narrowed(first, given[few], reference, start, widths, level, motions)
     around = trees.neighbors(trees.Tree(second), second, min(_AROUND, len(second)))[1]
     narrow = np.geomspace(planes.TUKEY, _INNER, _STEADY)
     stays = given[many]
     for _ in range(_ROUNDS):
         found = planes.fitted(second, finer, found.pose, np.zeros(0), motions=motions)
-        noise = max(_core(found.off[found.over & (given[many] > 0)]), least)
-        stays = given[many] * _stayed(found.off, around, noise)
+        level = max(_core(found.off[found.over & (given[many] > 0)]), least)
+        stays = given[many] * _stayed(found.off, around, level)
         found = planes.fitted(
-            second, finer, found.pose, noise * narrow, weights=stays, motions=motions
+            second, finer, found.pose, level * narrow, weights=stays, motions=motions
         )
     wider = planes.fitted(
-        second, finer, found.pose, 1.5 * noise * narrow[-1:], weights=stays, motions=motions
+        second, finer, found.pose, 1.5 * level * narrow[-1:], weights=stays, motions=motions
     )
     before = planes.fitted(second, finer, start, np.zeros(0), motions=motions)
     agree, agreed = (
-        np.sum(given[many] * (one.over & (np.abs(one.off) < noise))) for one in (found, before)
+        np.sum(given[many] * (one.over & (np.abs(one.off) < level))) for one in (found, before)
     )
     # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
     drawn = _difference(wider.pose, found.pose)
@@ -122,15 +122,41 @@ def settled(
     )
 
 
+def _narrowed(
+    points: Float[np.ndarray, "p 3"],
+    given: Float[np.ndarray, "p"],
+    reference: Prepared,
+    start: RigidTransform,
+    widths: Float[np.ndarray, "i"],
+    level: float,
+    motions: Float[np.ndarray, "6 f"],
+) -> planes.Fitted:
+    """The pose fitted with a kernel that narrows: to all points, or to a half if more agree there.
+
+    Where a whole side moved, as the snow on one, all points fit best under a pose that tilts between
+    the sides, at every width. The points are halved across their two longest axes.
+    """
+    inner = points - points.mean(axis=0)
+    along = inner @ np.linalg.eigh(inner.T @ inner)[1][:, :0:-1]
+    first = (along > np.median(along, axis=0)).T
+    fits = [
+        planes.fitted(points, reference.surface, start, widths, motions=motions, weights=weights)
+        for weights in (given, *(given * half for half in (*first, *~first)))
+    ]
+    agree = [np.sum(given * (fit.over & (np.abs(fit.off) < level))) for fit in fits]
+    best = int(np.argmax(agree))
+    return fits[best] if agree[best] > _MORE * agree[0] else fits[0]
+
+
 def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
     return np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int)
 
 
-def _noise(source: Prepared, reference: Prepared) -> tuple[float, float]:
+def noise(source: Prepared, reference: Prepared, count: int = _FIRST) -> tuple[float, float]:
     """The median thickness of pieces of surface and its floor, in radii of the reference."""
     levels, widths = [], []
     for cloud in (source, reference):
-        found = planes.patches(cloud.points, cloud.tree, cloud.points[_rows(cloud, _FIRST)])
+        found = cloud.surface.next_to(cloud.points[_rows(cloud, count)])
         levels.append(np.median(found.noise) * cloud.radius / reference.radius)
         widths.append(np.median(found.width) * cloud.radius / reference.radius)
     least = max(planes.FLOOR * float(max(widths)), _LEAST)

@@ -17,7 +17,17 @@ from jaxreg.judge.evidence import Evidence
 from jaxreg.judge.odds import chances
 from jaxreg.refine.host import Refined, refine_indexed, unrefined
 from jaxreg.refine.uncertainty import PoseUncertainty, WeakDirection, about, weak_directions
-from jaxreg.scans import candidates, dense, diagnosis, free_space, halves, prepare, stable, verdict
+from jaxreg.scans import (
+    candidates,
+    dense,
+    diagnosis,
+    free_space,
+    halves,
+    prepare,
+    stable,
+    verdict,
+    weak,
+)
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
@@ -278,12 +288,11 @@ def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Cl
     source, reference = problem.source, problem.reference
     pose = in_unit(refined.transform, float(problem.where.length))
     now = dense.at_a_glance(source, reference, pose)
-    weights = problem.known.weights
+    weights, reach = problem.known.weights, problem.reach() * float(problem.where.length)
     if weights is None and not (now.suspicious or now.drawn):
-        return _Closing()
+        return _Closing(cause=_slight_size(problem, pose, now))
     settled = None
     if problem.config.refine is not None:
-        reach = problem.reach() * float(problem.where.length)
         settled = stable.settled(source, reference, pose, reach, known=problem.known)
         # Where the points are few, patches of the surface are coarser than what was found before.
         given = weights is not None and settled.no_worse
@@ -296,7 +305,20 @@ def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Cl
         if not cause and weights is None:
             # Where a part has moved, the points on it are off.
             cause = settled.doubt if settled else dense.different_text(now)
+    if not cause and weights is None:
+        cause = _slight_size(problem, pose, now)
     return _Closing(settled, cause)
+
+
+def _slight_size(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
+    """A sentence if nearly all of the source can be compared and fits at a slightly other size."""
+    radii = sorted((problem.source.radius, problem.reference.radius))
+    alike = now.comparable and radii[1] < _UNLIKE_SIZES * radii[0]
+    if not alike or problem.config.refine is None:
+        return ""
+    reach = problem.reach() * float(problem.where.length)
+    scale = dense.slight_size(problem.source, problem.reference, pose, reach)
+    return "" if scale is None else dense.slight_size_text(scale)
 
 
 def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
@@ -315,7 +337,7 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
     other = refine_pose(twin, searched(twin).pose).transform
     other = in_unit(other, float(twin.where.length))
     if dense.agreement(mirrored, reference, other).explains(now):
-        return "The mirrored source fits better."
+        return dense.MIRRORED
     return ""
 
 
@@ -332,9 +354,14 @@ def finished(
     source, where = problem.source, problem.where
     length, cause = float(where.length), closing.cause
     covariance = problem.known.conditional(_covariance(refined.uncertainty, length))
-    if closing.settled is not None:
-        last, covariance = closing.settled.pose, closing.settled.covariance
-        refined = refined._replace(transform=last._replace(translation=last.translation / length))
+    hardly_held = weak_directions(problem.known.held(refined.uncertainty))
+    settled, as_good = closing.settled, ()
+    if thorough and found.probability >= least:
+        pose = refined.transform if settled is None else in_unit(settled.pose, 1 / length)
+        settled, as_good = _along_weak(problem, pose, hardly_held, settled)
+    if settled is not None:
+        covariance = settled.covariance
+        refined = refined._replace(transform=in_unit(settled.pose, 1 / length))
     if thorough and found.probability >= least:
         covariance = _with_halves(problem, refined.transform, covariance)
     evidence, score = problem.clouds().judge(
@@ -348,29 +375,33 @@ def finished(
     if judged.same > _SOME_SAME and not found.given and problem.motions is None:
         points = source.points * (source.radius / length)
         others = candidates.with_half_turns(problem.clouds(), points, refined.transform, others)
-        most = problem.known.max_rotation_deg + _ROUNDING_DEG
-        others = tuple(
-            (other, odds)
-            for other, odds in others
-            if rotation_angle_deg(other.rotation, np.eye(3)) <= most
-        )
-    likelihood = chances(np.array([score[0], *(s for _, s in others)]))
-    weak = tuple(
-        direction._replace(point=where.reference_centre + length * direction.point)
-        for direction in weak_directions(problem.known.held(refined.uncertainty))
+    if as_good:
+        # Nothing tells these from the pose, so their odds are its own.
+        rivals = ((other, float(score[0])) for other in as_good)
+        others = candidates.distinct_from(refined.transform, (*others, *rivals))
+    most = problem.known.max_rotation_deg + _ROUNDING_DEG
+    others = tuple(
+        (other, odds)
+        for other, odds in others
+        if rotation_angle_deg(other.rotation, np.eye(3)) <= most
     )
-    chance = 0.0 if cause or verdict.is_free(judged, weak) else float(likelihood[0])
+    likelihood = chances(np.array([score[0], *(s for _, s in others)]))
+    free = tuple(
+        direction._replace(point=where.reference_centre + length * direction.point)
+        for direction in hardly_held
+    )
+    chance = 0.0 if cause or verdict.is_free(judged, free) else float(likelihood[0])
     success = verdict.is_success(chance, likelihood[1:], refined.converged)
     reason = ""
     if not success:
         rivals = float(likelihood[1:].sum())
         cause = cause or _contradiction(problem, refined.transform)
-        reason = cause or _reason(problem, refined, judged, weak, rivals)
+        reason = cause or _reason(problem, refined, judged, free, rivals)
     return assembled(
         (source, problem.reference),
         in_unit(refined.transform, length),
         Verdict(success, chance, reason, judged),
-        Accuracy(covariance, weak, refined.converged),
+        Accuracy(covariance, free, refined.converged),
         distance=problem.distance * length,
         overlap=_overlap(problem, refined.transform),
         alternatives=tuple(
@@ -380,6 +411,26 @@ def finished(
         ),
         notes=closing.notes,
     )
+
+
+def _along_weak(
+    problem: Problem,
+    pose: RigidTransform,
+    hardly_held: tuple[WeakDirection, ...],
+    settled: stable.Settled | None,
+) -> tuple[stable.Settled | None, tuple[RigidTransform, ...]]:
+    """A better pose along weak directions settled, else what was; the poses that fit as well."""
+    if not hardly_held or problem.config.refine is None or problem.known.weights is not None:
+        return settled, ()
+    source, reference, length = problem.source, problem.reference, float(problem.where.length)
+    reach = problem.reach() * length
+    directions = tuple(one._replace(point=length * one.point) for one in hardly_held)
+    found = weak.elsewhere(
+        source, reference, in_unit(pose, length), directions, reach, problem.known
+    )
+    if found.better is not None:
+        settled = stable.settled(source, reference, found.better, reach, known=problem.known)
+    return settled, tuple(in_unit(other, 1 / length) for other in found.as_good)
 
 
 def _with_halves(
@@ -401,7 +452,7 @@ def _reason(
     problem: Problem,
     refined: Refined,
     judged: Evidence,
-    weak: tuple[WeakDirection, ...],
+    free: tuple[WeakDirection, ...],
     rivals: float,
 ) -> str:
     """Why the pose is not trusted, and whether the clouds seem to be in different units."""
@@ -410,7 +461,7 @@ def _reason(
     moving = f"The pose was still moving after {refined.iterations} iterations of the refinement."
     return " ".join(
         [
-            moving if refined.converged is False else verdict.reason(judged, weak, rivals),
+            moving if refined.converged is False else verdict.reason(judged, free, rivals),
             *(f"{told[:1].upper()}{told[1:]}." for told in units),
         ]
     )
