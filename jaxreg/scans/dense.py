@@ -7,6 +7,7 @@ stretched or sheared, or mirrored? Where a large share of all points lies off wi
 surfaces are of different shapes.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ _SPREAD = 1.15
 """Of normal errors half are below 0.67; right poses of real scans have 0.6 to 1.1, one of 19 1.2."""
 _BETTER = 0.4
 """Another cause fits better if it leaves this share of the points that are off."""
+_NEARER = 0.6
+"""Or, where nothing fitted to the noise, this share of the distances."""
 _SIZES = 0.005
 """The smallest change of size, as a share, that is told; twice that between two directions."""
 _MOST = 0.25
@@ -49,8 +52,9 @@ _STARTS = 0.96, 1.0, 1.04
 _NARROWING = 8
 _LIMIT, _FIRST_WIDTH = 8.0, 40.0
 """Noise levels from which a point counts in full against a size, and where the first kernel ends."""
-_CLEARLY = 3.0
-"""Standard errors by which the fit at another size is better (docs/notes/0065)."""
+_CLEARLY, _BESIDE_BIAS = 5.0, 0.4
+"""Standard errors by which the fit at another size is better, and how large the difference of size is
+beside what both ways err by together (docs/notes/0065)."""
 _ITERATIONS = 30
 MIRRORED = "The mirrored source fits better."
 _WIDEST = 3.0
@@ -93,8 +97,10 @@ class Agreement(NamedTuple):
     def explains(self, other: "Agreement") -> bool:
         """Whether this is a far better fit than the other, to the noise or nearer to it."""
         to_the_noise = self.spread <= max(other.spread, _SPREAD)
-        fewer_off = self.off <= _BETTER * other.off
-        return self.compared >= 0.9 * other.compared and fewer_off and to_the_noise
+        better = self.off <= _BETTER * other.off or (
+            other.drawn and self.off <= other.off and self.spread <= _NEARER * other.spread
+        )
+        return self.compared >= 0.9 * other.compared and better and to_the_noise
 
 
 def agreement(
@@ -167,14 +173,17 @@ def slight_size(
     `reach` is the largest distance of corresponding points.
     """
     ways = ((source, reference, pose), (reference, source, se3.inverted(pose)))
-    hint, back = (_step_of_size(*way) for way in ways)
-    if abs(hint - back) / 2 < _HINT * _SLIGHTLY:
+    first, back = (_step_of_size(*way) for way in ways)
+    if min(first.over.mean(), back.over.mean()) < _ENOUGH:
+        # What one of them shows beyond the other draws the fit of its points.
+        return None
+    if abs(math.log(first.scale / back.scale)) / 2 < _HINT * _SLIGHTLY:
         return None
     (scale, better), (inverse, back_better) = (_sized(*way, reach) for way in ways)
-    scale = math.sqrt(scale / inverse)
-    if abs(math.log(scale)) < _SLIGHTLY or max(better, back_better) < _CLEARLY:
+    size, bias = math.log(scale / inverse) / 2, math.log(scale * inverse) / 2
+    if abs(size) < max(_SLIGHTLY, _BESIDE_BIAS * abs(bias)) or max(better, back_better) < _CLEARLY:
         return None
-    return scale
+    return math.exp(size)
 
 
 def stretched(
@@ -250,12 +259,11 @@ def _in_radii(
     return some, RigidTransform(pose.rotation, shift), stable.noise(moving, fixed, _SHOWN)[0]
 
 
-def _step_of_size(moving: Prepared, fixed: Prepared, pose: RigidTransform) -> float:
-    """The logarithm of the scale after one Gauss-Newton step of seven unknowns."""
+def _step_of_size(moving: Prepared, fixed: Prepared, pose: RigidTransform) -> planes.Fitted:
+    """The pose and scale after one Gauss-Newton step of seven unknowns."""
     some, pose, noise = _in_radii(moving, fixed, pose, _SHOWN)
     width = np.array([_FIRST_WIDTH * noise])
-    found = planes.fitted(some, fixed.surface, pose, width, motions=np.eye(6), scale=1.0)
-    return math.log(found.scale)
+    return planes.fitted(some, fixed.surface, pose, width, motions=np.eye(6), scale=1.0)
 
 
 def _sized(
@@ -263,14 +271,19 @@ def _sized(
 ) -> tuple[float, float]:
     """The scale at which a cloud fits best, and by how many standard errors it is better there."""
     some, pose, noise = _in_radii(moving, fixed, pose, _SIZED)
-    limit = np.array([_LIMIT * noise])
     widths = np.geomspace(max(reach / fixed.radius, _LIMIT * noise), 5 * noise, _NARROWING)
-    now = planes.misfit(some @ pose.rotation.T + pose.translation, fixed.surface, limit)
+    fitted = functools.partial(planes.fitted, some, fixed.surface, pose, motions=np.eye(6))
+    now = fitted(np.zeros(0))
     scale, better = 1.0, -np.inf
     for start in _STARTS:
-        found = planes.fitted(some, fixed.surface, pose, widths, motions=np.eye(6), scale=start)
-        moved = found.scale * some @ found.pose.rotation.T + found.pose.translation
-        errors = -float(planes.errors_worse(planes.misfit(moved, fixed.surface, limit), now)[0])
+        found = fitted(widths, scale=start)
+        # A smaller cloud has fewer points beyond where the other ends, which says nothing of its size.
+        both = now.over & found.over
+        then, before = (
+            np.minimum(np.abs(one.off[both]) / (_LIMIT * noise), 1)[None] ** 2
+            for one in (found, now)
+        )
+        errors = -float(planes.errors_worse(then, before)[0]) if both.any() else -np.inf
         if errors > better:
             scale, better = found.scale, errors
     return scale, better

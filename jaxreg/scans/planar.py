@@ -298,7 +298,7 @@ def _cause(
 ) -> str:
     """A sentence where many points lie off the other line: another size, a mirror image, or a doubt."""
     now = _agreement(x, y, ratio, fit)
-    if now.compared < _COMPARED or now.off < _SUSPECT:
+    if now.compared < _COMPARED or (now.off < _SUSPECT and not now.drawn):
         return ""
     widths = np.geomspace(_START, planes.TUKEY * max(_noise(x, y, ratio), 1e-6), _NARROWING)
     sized = planes.fitted(x.points * ratio, y.surface, fit.pose, widths, motions=MOTIONS, scale=1.0)

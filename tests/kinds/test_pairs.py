@@ -510,16 +510,8 @@ OTHER = {
 OTHER_WRONG = {
     "mirrored monitor": "success, p = 1.00; 4 % of the points lie up to 50 noise levels off",
     "mirrored shoe of 1,000 points": "success, p = 0.99; a sixth of the points lie 5 noise levels off",
-    "stairs, 5 % larger": "success, p = 1.00; a third of the points lie 8 noise levels off",
-    "chair, 5 % larger": "success, p = 1.00; 14 % of the points lie 8 noise levels off",
-    "shelf, 5 % larger": "success, p = 0.99; a fifth of the points lie 8 noise levels off",
-    "airplane of 3,000 points, 5 % larger": "success, p = 0.98; a third lies 8 noise levels off",
-    "bracket of 1,000 points, 5 % larger": "success, p = 0.97; a quarter lies 8 noise levels off",
-    "parts of stairs, 6 % larger": "success, p = 0.84: 4 times as far off as is allowed",
     "parts of a chair, 6 % larger": "success, p = 0.98, turned by 90 degrees",
     "lamp, 5 % larger": "success, p = 0.95, upside down: fitness 0.4, the foot on the foot",
-    "mirrored floor": "success, p = 1.00; a fifth of the points lie 8 noise levels off",
-    "floor, 2 % larger": "success, p = 1.00; 60 % of the points lie 8 noise levels off",
 }
 
 NEIGHBOURS = {
@@ -531,10 +523,7 @@ NEIGHBOURS = {
     "fruit, nearly a sphere": lambda: fruit(0.05, 4000, 7),
     "fruit, nearly a sphere, of 8,000 points": lambda: fruit(0.03, 8000, 6),
 }
-NEIGHBOURS_WRONG = {
-    "fruit, nearly a sphere": "success, p = 1.00, 5.8 degrees off, 30 times the sigma",
-    "fruit, nearly a sphere, of 8,000 points": "success, p = 1.00, 5.9 degrees, 40 times the sigma",
-}
+NEIGHBOURS_WRONG = {}
 
 
 # A4: refine until it stands still.
@@ -617,12 +606,10 @@ STARTS = {
     "relief, one iteration": lambda: nudged(relief, iterations=1),
 }
 STARTS_WRONG = {
-    "road": "success, p = 1.00, converged, 0.67 m off, sigma 4 mm; a second run goes there",
     "road, one iteration": "success, p = 1.00, converged, 1.4 m off",
     "tunnel, point to point": "success, p = 1.00, converged, 0.41 m off, sigma 8 mm",
     "corridor, point to point": "success, p = 1.00, converged, 0.39 m off, sigma 35 mm",
     "tunnel": "success, p = 1.00, 1.0 degrees off, 14 times the sigma",
-    "relief, one iteration": "success, p = 1.00, converged, 2.1 degrees and 0.19 m off",
 }
 
 
@@ -729,9 +716,6 @@ MOVED = {
     "heaps and pits of 30 %, by 0.3 m": lambda: slid("heaps", 0.3, 0.3),
 }
 MOVED_WRONG = {
-    "ice of 30 %, by 1 m": "success, p = 1.00, no note; 0.42 degrees and 0.36 m off: tilted",
-    "ice of a tenth, by 1 m": "right to 3 mm and refused: of another shape, it fits stretched",
-    "sunk by 1 m, a fifth": "right to 5 cm and refused: of another shape, it fits stretched",
     "tongue of 30 %, by 1 m": "success, p = 1.00, no note; 0.18 m off",
     "heaps and pits of 30 %, by 0.3 m": "success, p = 1.00, no note; 0.13 m off",
 }
@@ -887,22 +871,12 @@ SYMMETRIC = {
     "brick at another size": lambda: estimated(pair(BRICK, 2000, noise=0.003), 2.0),
     "pentagon in the plane at another size": lambda: estimated(outline(5), 1.5),
 }
-FREE = "success, p = 1.00, though it turns freely; 8 to 18 degrees off, sigma below 1 degree"
-ALONE = "success, p = 1.00, without alternatives: the last pose of scale=True has no rivals"
 SYMMETRIC_WRONG = {
     "copy of a lattice, diamond": "success, p = 1.00, alone: a third of a turn is as good",
-    "sphere from a start": FREE,
-    "vase from a start": FREE,
-    "vase, limited": FREE,
-    "sphere, limited": FREE,
-    "pipe, upright, from a start": FREE,
     "stairs of equal steps": "success, p = 0.99, without alternatives: half a turn is as good",
     "sleepers": "success, p = 0.92: half a turn is as good",
     "box in a scene": "success, p = 1.00, without alternatives: half turns are as good",
     "two brackets in a scene": "success, p = 0.83, without alternatives: the other is as good",
-    "patch of a plane in a scene": "success, p = 1.00, alone, metres off: it may be slid anywhere",
-    "brick at another size": ALONE,
-    "pentagon in the plane at another size": ALONE,
 }
 SLOW_SYMMETRIC = (
     "box in a scene",
@@ -1107,10 +1081,7 @@ PATTERNS = {
     "isosceles triangle in the plane": (np.array([[0.0, 0], [10, 0], [5, 12]]), {}, 1),
 }
 """Points, options, and how many turns map them to themselves: of points of one z, about z."""
-PATTERNS_WRONG = {
-    "trapezoid in the plane": "refused: a pose that is turned over counts as a rival",
-    "isosceles triangle in the plane": "refused: a pose that is turned over counts as a rival",
-}
+PATTERNS_WRONG = {}
 
 
 def swapped_columns(entry="register") -> Member:
@@ -1128,12 +1099,7 @@ UNLIKE = {
     "columns swapped": swapped_columns,
     "columns swapped, shell": lambda: swapped_columns("shell"),
 }
-UNLIKE_WRONG = {
-    "5 mirrored in the plane": "success, p = 1.00, with the plane turned over: z is -1",
-    "15 mirrored in the plane": "success, p = 1.00, with the plane turned over: z is -1",
-    "columns swapped": "success, p = 1.00, by 4 of 12 targets; mirrored, all 12 fit",
-    "columns swapped, shell": "exit status 0, by 4 of 12 targets; mirrored, all 12 fit",
-}
+UNLIKE_WRONG = {}
 
 
 # B9: two dimensions.
@@ -1291,12 +1257,7 @@ ALIKE = {
     "offices": lambda: scanned_twice((15, 7), (22, 3)),
     "an office and the corridor": lambda: scanned_twice((22, 3), (26, 7)),
 }
-ALIKE_WRONG = {
-    "ends of a corridor": "success, p = 0.99: turned by 180 degrees, 24 m off",
-    "ends of a corridor, from where": "success, p = 0.99: turned by 180 degrees, 24 m off",
-    "offices": "success, p = 0.95, 10 m off",
-    "an office and the corridor": "success, p = 0.91: turned by 90 degrees, 8 m off",
-}
+ALIKE_WRONG = {}
 
 
 # B10: what is known of the pair.
@@ -1428,7 +1389,6 @@ def test_mirror_images_and_other_sizes_and_objects_are_no_success(make, tmp_path
     assert not answer(make(), tmp_path).success
 
 
-@pytest.mark.xfail(strict=True, reason="all three are placed, p = 1.00: no cause is looked for")
 def test_a_scan_of_a_larger_part_is_not_placed_among_others():
     assert len(jaxreg.register_many(third_resized()).groups[0]) == 2
 
@@ -1521,7 +1481,6 @@ def test_places_that_look_alike_in_the_plane_are_right_or_no_success(make, tmp_p
     assert_honest(answer(member, tmp_path), member)
 
 
-@pytest.mark.xfail(strict=True, reason="success: the axis that was given is ignored in the plane")
 def test_an_axis_in_the_plane_is_kept_or_refused():
     """Turned by 60 degrees about z, and known="upright" with up="y" says that y stays."""
     member = at_heights(rooms_in_plan(degrees=60.0), known="upright", up="y")

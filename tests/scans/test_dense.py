@@ -150,3 +150,15 @@ def test_a_part_that_moved_is_no_other_cause(rng):
     found = register(plates(rng, 6000), points, config=NARROW)
     assert found.success
     np.testing.assert_allclose(found.transformation, np.eye(4), atol=0.01)
+
+
+@pytest.mark.parametrize("count", [1000, 6000])
+@pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
+def test_a_part_a_little_larger_or_smaller_is_told_at_any_number_of_points(rng, count, scale):
+    source, reference = plates(rng, count), scale * plates(rng, count)
+    rotation, shift = pose(rng, 180.0)
+    found = register(source, moved(reference, rotation, shift), config=NARROW)
+    assert found.success == (scale == 1)
+    if scale != 1:
+        told = float(found.reason.split("fits at ")[1].split()[0])
+        assert told == pytest.approx(scale, abs=0.02)

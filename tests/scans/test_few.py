@@ -187,3 +187,23 @@ def test_weights_of_a_few_points_are_refused(rng):
         register(source, reference, weights=np.arange(1.0, 9))
     left_out = np.r_[np.zeros(2), np.ones(6)]
     assert register(source, reference, weights=left_out).evidence.of == 6
+
+
+def test_targets_in_the_plane_are_not_turned_over(rng):
+    trapezoid = np.array([[0.0, 0], [10, 0], [7, 6], [3, 6]])
+    turn = Rotation.from_euler("z", 20, degrees=True).as_matrix()[:2, :2]
+    found = register(trapezoid, rng.permutation(trapezoid @ turn.T + 3.0))
+    assert found.success
+    np.testing.assert_allclose(found.rotation[:2, :2], turn, atol=1e-9)
+    mirrored = rng.uniform(0, 10, (12, 2))
+    assert not register(mirrored * [1, -1], rng.permutation(mirrored @ turn.T)).success
+
+
+def test_mirrored_targets_of_which_some_fit_are_told(rng):
+    points = targets(rng, 12)
+    # Easting and northing in the wrong order: four targets near a mirror plane fit all the same.
+    points[:4, 1] = points[:4, 0]
+    reference, _ = turned(rng, points)
+    found = register(points[:, [1, 0, 2]], reference)
+    assert not found.success
+    assert "mirrored" in found.reason

@@ -234,3 +234,21 @@ def test_planes_find_the_pose_of_exact_planes(seed):
     )
     np.testing.assert_allclose(found.pose.rotation, rotation, atol=1e-6)
     np.testing.assert_allclose(found.pose.translation, shift, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"), [([1.01, 1.01], "The source fits at 1.010"), ([1, -1], "mirrored")]
+)
+def test_a_plan_of_another_size_and_a_mirrored_one_are_told(change, told, seed):
+    rng = np.random.default_rng(seed)
+    reference = moved(walls(rng) * np.array(change), 60, [5, -3])
+    found = register(walls(rng), reference)
+    assert not found.success
+    assert told in found.reason
+
+
+def test_another_axis_than_that_of_the_plane_is_refused(seed):
+    rng = np.random.default_rng(seed)
+    source, reference = walls(rng), moved(walls(rng), 20, [1, 2])
+    with pytest.raises(ValueError, match="a turn is about z"):
+        register(source, reference, known="upright", up="y")
