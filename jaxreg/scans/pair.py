@@ -43,10 +43,11 @@ def register(
     Clouds of at most 60 points each (targets, fiducials, stems) are matched point by point: the poses
     on which most points agree are sought among all triples, and `evidence` is a `FewEvidence`.
 
-    `initial` (4x4 or a `RigidTransform`) starts from a known pose. The search is skipped, so
-    `alternatives` is empty and the verdict does without rival poses. `max_rotation_deg` is the
-    largest rotation to consider (None: any); it decides between the poses of a symmetric shape, and a
-    result beyond it by more than a degree is no success.
+    `initial` (4x4 or a `RigidTransform`) starts from a known pose. The search is skipped, so the only
+    rival poses (`alternatives`) are those along motions that the surfaces hardly resist, as that of
+    a vase turned about its axis. `max_rotation_deg` is the largest rotation to consider (None: any);
+    it decides between the poses of a symmetric shape, and a result beyond it by more than a degree is
+    no success.
     `known` says what is known of the pair: "upright", both scans have the axis `up` ("x", "y", "z"
     or a vector) upwards, so that the source is turned about it alone; "inside", the source lies
     wholly in the reference, which shows far more; or both. With `scale` the size of the source is

@@ -110,7 +110,7 @@ class Problem(NamedTuple):
 class Found(NamedTuple):
     """The chosen pose in the frame, the others with their log odds, and how likely it is right.
 
-    A pose that was `given` was not searched for, and has no rivals.
+    A pose that was `given` was not searched for: its rivals are those along its weak directions.
     """
 
     pose: RigidTransform
