@@ -21,7 +21,7 @@ from jaxreg.geometry.neighbors import knn, without_padding
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.geometry.procrustes import robust_procrustes
 from jaxreg.network import matching_blocks
-from jaxreg.network.features import BATCH_AXIS, DGCNN, STATISTICS, relative_neighbors
+from jaxreg.network.features import DGCNN, STATISTICS, relative_neighbors
 from jaxreg.network.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import (
@@ -309,14 +309,6 @@ def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
             f"variables have the keys {sorted(variables)}: give both params and batch_stats, of "
             "the network that config describes, as jaxreg.load_pretrained returns them."
         )
-    if train:
-        try:
-            jax.lax.axis_index(BATCH_AXIS)
-        except NameError:
-            raise ValueError(
-                "train=True takes the statistics of a batch: call it under jax.vmap(..., "
-                f"axis_name={BATCH_AXIS!r})."
-            ) from None
     cast = {"params": variables["params"]} if train else variables
     return variables | jax.tree.map(lambda x: jnp.asarray(x, dtype), dict(cast))
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.config import Config, IDAMConfig
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import knn, nearest_in
@@ -132,6 +133,7 @@ def distance_augmented(source: Kept, reference: Kept) -> Float[Array, "k l d"]:
     return jnp.concatenate([first, second, distance, direction], axis=-1)
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],
