@@ -39,7 +39,8 @@ class ExportedProgram:
     it takes: fewer are padded and masked, or, where `points` is None, any number from 256 to 2048.
     `platforms` are those it was made for.
 
-    Under `jax.vmap` the pairs are computed one after the other. It has no derivative. It may be pickled.
+    Under `jax.vmap` the pairs are computed one after the other; it has no derivative; and it may be
+    pickled.
     """
 
     name: str
