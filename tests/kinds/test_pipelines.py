@@ -966,11 +966,6 @@ def test_a_handful_of_programs_serve_clouds_of_every_size(caplog, name):
     assert len(found) <= most
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="68 programs for 400 pairs of 300 to 3000 points, and more for more: one for every pair of "
-    "sizes that differ by more than twice",
-)
 def test_a_stream_of_pairs_of_every_size_needs_thirty_programs(monkeypatch):
     seen = set()
 
