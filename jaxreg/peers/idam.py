@@ -166,7 +166,7 @@ def register(
         kept.append(Kept(rows, PointCloud(cloud.points[rows], mask), features[rows]))
     *_, last = _steps(variables, *kept, config=config, train=False)[0]
     every = clouds[0].mask.astype(clouds[0].points.dtype)
-    plain = pair.registration(last.transform, *clouds, every)
+    plain = pair.registration(last.transform, *clouds, every, scores=(last.scores, last.validity))
     rows = jnp.where(kept[0].cloud.mask, kept[0].rows, clouds[0].mask.shape[0])
     matched = kept[1].cloud.points[last.columns]
     confidence = jnp.zeros_like(plain.confidence).at[rows].set(last.weights, mode="drop")

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments, frame, rigid
+from jaxreg.geometry.numerics import all_finite
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
 from jaxreg.search.config import SearchConfig
@@ -128,10 +129,8 @@ def _described(
         shape = source.shape[0], reference.shape[0]
         similarity = arguments.rows("similarity", similarity, shape, source)
         both = source_mask[:, None] & reference_mask[None, :]
-        source_mask &= jnp.all(jnp.isfinite(similarity) | ~both)
-    if network is not None:
-        for weights in network.values():
-            source_mask &= jnp.all(jnp.isfinite(weights))
+        source_mask &= all_finite(jnp.where(both, similarity, 0))
+    source_mask &= all_finite(network)
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     one = describe(x, source_mask, unit=1.0, config=config)
     other = describe(y, reference_mask, unit=1.0, config=config)

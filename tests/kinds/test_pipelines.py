@@ -300,6 +300,20 @@ def test_features_of_a_network_that_diverged_are_not_valid():
     assert not jax.jit(jaxreg.register_global)(X, Y, network=network).valid
 
 
+@pytest.mark.parametrize("name", ["paper", *LEARNED])
+def test_a_network_whose_weights_diverged_finds_nothing_valid(name):
+    config = Config(network=name, model=SMALL)
+
+    def run(x, y):
+        variables = by_name.init_variables(jax.random.key(0), config)
+        diverged = jax.tree.map(lambda w: w * jnp.nan, variables["params"])
+        return by_name.register(variables | {"params": diverged}, x, y, config=config)
+
+    found = jax.jit(run)(X, Y)
+    assert not found.valid
+    np.testing.assert_array_equal(found.transformation, np.eye(4))
+
+
 SOLVED = {
     "fixed by their numbers": (lambda g, p: {"fixed": [0]}, "fixed"),
     "too few fixed": (lambda g, p: {"fixed": np.array([True])}, "fixed"),
