@@ -5,6 +5,7 @@ the network's code nor its weights, and traces nothing; XLA compiles it for the 
 """
 
 import dataclasses
+import functools
 import json
 import zipfile
 import zlib
@@ -37,12 +38,15 @@ class ExportedProgram:
     `name` is "register_global", or that of the weights. `points` are the numbers of rows (n, m) that
     it takes: fewer are padded and masked, or, where `points` is None, any number from 256 to 2048.
     `platforms` are those it was made for.
+
+    Under `jax.vmap` the pairs are computed one after the other; it has no derivative; and it may be
+    pickled.
     """
 
     name: str
     points: tuple[int, int] | None
     platforms: tuple[str, ...]
-    _call: Callable[..., Any] = dataclasses.field(repr=False)
+    _exported: export.Exported = dataclasses.field(repr=False)
 
     def __call__(
         self,
@@ -56,7 +60,7 @@ class ExportedProgram:
 
         Raises:
           ValueError: a cloud is not (n, 3), has more rows than the program takes, or its mask is not
-            (n,) of bools.
+            (n,) of bools; or a derivative is asked for.
         """
         count = len(source)
         sides = (("source", source, source_mask), ("reference", reference, reference_mask))
@@ -69,6 +73,25 @@ class ExportedProgram:
         return found._replace(
             confidence=found.confidence[:count], correspondences=found.correspondences[:count]
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        written = bytes(self._exported.serialize())
+        return _restored, (self.name, self.points, self.platforms, written)
+
+    @functools.cached_property
+    def _call(self) -> Callable[..., Any]:
+        # JAX has no rule to batch such a program, which was made for one pair.
+        call = jax.custom_jvp(jax.custom_batching.sequential_vmap(self._exported.call))
+
+        @call.defjvp
+        def derivative(_, __):
+            raise ValueError(
+                f"the program of {self.name} was exported without derivatives: differentiate the "
+                "function that it was made of (jaxreg.register_global, jaxreg.register_pair), or take "
+                "jax.lax.stop_gradient of the clouds."
+            )
+
+        return jax.jit(call)
 
     def _padded(self, name: str, points: Any, mask: Any, side: int) -> tuple[Array, Array]:
         points = jnp.asarray(points, jnp.float32)
@@ -152,7 +175,7 @@ def load_exported(path: str | Path) -> ExportedProgram:
             "newer one, or export the program again."
         )
     try:
-        call = jax.jit(export.deserialize(bytearray(program)).call)
+        exported = export.deserialize(bytearray(program))
     except Exception as error:  # noqa: BLE001 - JAX raises what its parsers choose
         raise ValueError(
             f"{path} cannot be read by JAX {jax.__version__} ({error}): export it again."
@@ -162,9 +185,16 @@ def load_exported(path: str | Path) -> ExportedProgram:
         if card["points"] is not None:
             source, reference = card["points"]
             points = int(source), int(reference)
-        return ExportedProgram(card["name"], points, tuple(card["platforms"]), call)
+        return ExportedProgram(card["name"], points, tuple(card["platforms"]), exported)
     except (KeyError, TypeError, ValueError):
         raise ValueError(_NO_PROGRAM.format(path)) from None
+
+
+def _restored(
+    name: str, points: tuple[int, int] | None, platforms: tuple[str, ...], program: bytes
+) -> ExportedProgram:
+    """What was pickled."""
+    return ExportedProgram(name, points, platforms, export.deserialize(bytearray(program)))
 
 
 def _unpacked(path: str | Path) -> tuple[dict[str, Any], bytes]:

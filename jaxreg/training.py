@@ -233,6 +233,24 @@ def validate(variables: Variables, shapes: np.ndarray, config: Config) -> dict[s
     }
 
 
+def _check_validation(shapes: np.ndarray, config: Config) -> None:
+    """Raise ValueError where `validate` would: hours later, at the first validation.
+
+    A pair of one shape is traced as far as its pose, which computes nothing.
+    """
+
+    def pose(key, shape):
+        pair = make_pair(key, shape, config.test_pairs)
+        variables = by_name.init_variables(key, config)
+        return by_name.pose(variables, pair.source, pair.reference, config=config)
+
+    shape = jax.ShapeDtypeStruct(shapes.shape[1:], shapes.dtype)
+    try:
+        jax.eval_shape(pose, jax.eval_shape(lambda: jax.random.key(0)), shape)
+    except ValueError as error:
+        raise ValueError(f"the pairs to validate on ([test_pairs]) do not fit: {error}") from None
+
+
 def train(config: Config, workdir: str | Path, *, root: str | Path | None = None) -> Variables:
     """Train in `workdir`, resuming any run there; returns the variables of lowest validation error.
 
@@ -244,7 +262,8 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
     and of others (`jaxreg.devices.join_processes`), each takes a share of every batch.
 
     Raises:
-      ValueError: `config` has a number out of range, the devices do not divide the batch,
+      ValueError: `config` has a number out of range, `[test_pairs]` asks for more points than there
+        are or the network needs more than they leave, the devices do not divide the batch,
         `workdir` cannot be written to, the data is missing, the weights to start from do not
         exist or do not fit, another process trains in `workdir`, or it contains a run with
         another configuration.
@@ -267,6 +286,7 @@ def train(config: Config, workdir: str | Path, *, root: str | Path | None = None
         validation_points=shape_points(config.test_pairs),
         seed=config.train.seed,
     )
+    _check_validation(held_out, config)
     mesh = devices.mesh_of_all()
     devices.check_shares(config.train.batch, mesh)
     on_device = devices.on_all(jnp.asarray(shapes), mesh)

@@ -42,7 +42,7 @@ class Registration(NamedTuple):
     `transformation` is the 4x4 form of (`rotation`, `translation`). `correspondences[i]` is the
     reference copy of source point `i` (Eq. 6), a weighted mean of reference points, and
     `confidence[i]`, in [0, 1], its inlier confidence (Eq. 11). `valid` is False if a cloud had no
-    valid point; the transform is then the identity.
+    valid point, or if the result was not finite; the transform is then the identity.
 
     The other learned methods return it too (`jaxreg.peers`); each says what its confidence and its
     correspondences are.

@@ -14,7 +14,9 @@ from jaxreg._xla import row_min
 from jaxreg.geometry import arguments
 
 _BLOCK = 2048
-"""Points whose distances to all others are in memory at once."""
+"""Points whose distances to all others are in memory at once; fewer where there are many others."""
+_AT_ONCE = 2**26
+"""Distances that are in memory at once: 256 MiB of float32."""
 _ROUNDINGS = 4
 """By how much two distances may differ and still count as equal, in units of the last digit of the
 largest coordinate."""
@@ -69,7 +71,7 @@ def knn(
         negative, column = jax.lax.top_k(jnp.where(excluded, -jnp.inf, -distance), k)
         return jnp.where(jnp.isneginf(negative), row[:, None], order[column])
 
-    index = _in_blocks(of_rows, row)
+    index = _in_blocks(of_rows, row, n)
     # The barrier keeps XLA from merging later slices into the selection, which would turn the
     # fast call into a full sort of every row.
     return jax.lax.optimization_barrier(index.astype(jnp.int32))
@@ -96,19 +98,22 @@ def nearest_in(
     It is the first of those that are equally near, up to rounding.
     """
     points, others = jax.lax.stop_gradient((points, without_padding(others, mask)))
-    return _in_blocks(lambda rows: _nearest_of(rows, others, mask), points)
+    return _in_blocks(lambda rows: _nearest_of(rows, others, mask), points, others.shape[0])
 
 
-def _in_blocks(of_rows: Callable[[Array], Array], rows: Array) -> Array:
-    """``of_rows(rows)``, of a block of rows after the other if there are many.
+def _in_blocks(of_rows: Callable[[Array], Array], rows: Array, others: int) -> Array:
+    """``of_rows(rows)``, of a block of rows after the other if there are many, or many others.
 
     All distances of a large cloud at once would fill the memory.
     """
-    n = rows.shape[0]
-    if n <= _BLOCK:
+    n, block = rows.shape[0], _BLOCK
+    # A size that is a symbol, in a program to export, cannot be told to be large.
+    if isinstance(others, int) and others > _AT_ONCE // _BLOCK:
+        block = 1 << (max(_AT_ONCE // others, 1).bit_length() - 1)
+    if n <= block:
         return of_rows(rows)
-    padded = jnp.pad(rows, ((0, -n % _BLOCK), *[(0, 0)] * (rows.ndim - 1)))
-    found = jax.lax.map(of_rows, padded.reshape(-1, _BLOCK, *rows.shape[1:]))
+    padded = jnp.pad(rows, ((0, -n % block), *[(0, 0)] * (rows.ndim - 1)))
+    found = jax.lax.map(of_rows, padded.reshape(-1, block, *rows.shape[1:]))
     return found.reshape(-1, *found.shape[2:])[:n]
 
 

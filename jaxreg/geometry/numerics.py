@@ -4,9 +4,11 @@ Every function here has a finite derivative everywhere. Where the true one does 
 the origin, an angle of parallel vectors) it is zero, which is a valid subgradient of each of them.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import arguments
 
@@ -22,6 +24,14 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm along `axis`, with derivative 0 at the origin."""
     return safe_sqrt(jnp.sum(x * x, axis=axis))
+
+
+def all_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether no number in a tree of arrays is NaN or infinite."""
+    found = jnp.ones((), bool)
+    for leaf in jax.tree.leaves(tree):
+        found &= jnp.all(jnp.isfinite(leaf))
+    return found
 
 
 def leading_max(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import export
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.geometry import se3
 from jaxreg.geometry.small_linear import inverse_definite
 from jaxreg.graph.pose_graph import (
@@ -65,6 +66,7 @@ class _State(NamedTuple):
     damping: Float[Array, ""]
 
 
+@on_any_mesh
 def optimize_poses(
     graph: PoseGraph,
     initial: RigidTransform,
@@ -118,6 +120,7 @@ def optimize_poses(
         return _step(still, held, state._replace(weights=weights.astype(squared.dtype)), most)
 
     state = _State(start, squared, counted, jnp.asarray(_DAMPING, squared.dtype))
+    state = jax.tree.map(lambda x: varying_like(x, jnp.sum(squared)), state)
     state = jax.lax.fori_loop(0, rounds + iterations, iterate, state)
     step, decrement = _implicit_step(graph, state.poses, held, state.weights, most)
     poses = retract(state.poses, step)

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jaxreg.io.decoding import decoded, with_points
 from jaxreg.io.places import reading
 
 
 def read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
     """A 4x4 matrix from text, NPY, or the JSON that `jaxreg register` writes.
+
+    The text may be in any encoding and have decimal commas.
 
     Raises:
       ValueError: there is no such file, it is a directory, it may not be read, or it does not
@@ -30,11 +33,15 @@ def read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
 
 def _content(path: Path) -> object:
     if path.suffix.lower() == ".json":
-        content = json.loads(path.read_text("utf-8"))
+        content = json.loads(decoded(path, path.read_bytes()))
         return content["transformation"] if isinstance(content, dict) else content
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
-    return np.array(words(path.read_text("utf-8")), float).reshape(4, 4)
+    text = decoded(path, path.read_bytes())
+    numbers = words(text)
+    if len(numbers) != 16:  # The commas may be decimal marks, and tear numbers apart.
+        numbers = words(with_points(text.encode()).decode())
+    return np.array(numbers, float).reshape(4, 4)
 
 
 def words(text: str) -> list[str]:

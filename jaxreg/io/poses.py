@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxreg.io.decoding import decoded
 from jaxreg.io.matrix import words
 from jaxreg.io.places import reading
 
@@ -102,7 +103,7 @@ def read_g2o(path: str | Path) -> tuple[dict[int, Float[np.ndarray, "4 4"]], Edg
     vertices: dict[int, np.ndarray] = {}
     ends, transforms, information = [], [], []
     with reading(path):
-        lines = path.read_text("utf-8").splitlines()
+        lines = decoded(path, path.read_bytes()).splitlines()
     for number, line in enumerate(lines, start=1):
         row = line.split()
         try:
@@ -133,7 +134,7 @@ def read_pairs_log(
     """
     path = Path(path)
     with reading(path):
-        text = path.read_text("utf-8")
+        text = decoded(path, path.read_bytes())
     try:
         rows = [line.split() for line in text.splitlines() if line.strip()]
         if len(rows) % 5:
@@ -151,7 +152,7 @@ def _read(path: Path) -> _Poses:
         return read_g2o(path)[0]
     with reading(path):
         try:
-            text = path.read_text("utf-8")
+            text = decoded(path, path.read_bytes())
             return _from_json(text) if path.suffix.lower() == ".json" else _from_text(text)
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path} does not contain poses ({error}): {_REMEDY}.") from None

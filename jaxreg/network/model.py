@@ -18,10 +18,10 @@ from jaxreg.batching import one_at_a_time
 from jaxreg.config import Config, ModelConfig, check_options, model_config
 from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, without_padding
-from jaxreg.geometry.numerics import safe_sqrt
+from jaxreg.geometry.numerics import all_finite, safe_sqrt
 from jaxreg.geometry.procrustes import robust_procrustes
 from jaxreg.network import matching_blocks
-from jaxreg.network.features import BATCH_AXIS, DGCNN, STATISTICS, relative_neighbors
+from jaxreg.network.features import DGCNN, STATISTICS, relative_neighbors
 from jaxreg.network.inliers import InlierNetwork, PredecessorInlierNetwork, select_inliers
 from jaxreg.network.invariants import geometric_structure
 from jaxreg.network.matching import (
@@ -309,14 +309,6 @@ def _in_dtype(variables: Variables, dtype: Any, train: bool) -> Variables:
             f"variables have the keys {sorted(variables)}: give both params and batch_stats, of "
             "the network that config describes, as jaxreg.load_pretrained returns them."
         )
-    if train:
-        try:
-            jax.lax.axis_index(BATCH_AXIS)
-        except NameError:
-            raise ValueError(
-                "train=True takes the statistics of a batch: call it under jax.vmap(..., "
-                f"axis_name={BATCH_AXIS!r})."
-            ) from None
     cast = {"params": variables["params"]} if train else variables
     return variables | jax.tree.map(lambda x: jnp.asarray(x, dtype), dict(cast))
 
@@ -337,8 +329,8 @@ def register_pair(
 
     Clouds should have the scale that the weights were trained on (unit sphere for ModelNet40). Rows
     outside a mask are padding and have no effect, even if they are NaN. With no valid point in a
-    cloud, or with one that is not finite, `valid` is False and the transform is the identity. The
-    weights are used in the dtype of the clouds.
+    cloud, with one that is not finite, or with weights that diverged, `valid` is False and the
+    transform is the identity. The weights are used in the dtype of the clouds.
 
     Raises:
       ValueError: a cloud is not ``(n, 3)`` of float32 or float64; a mask is not ``(n,)`` of bools; K
@@ -354,7 +346,10 @@ def register_pair(
         observe=lambda step, graph: (step.confidence, step.matches.copy),
     )
     valid = source_usable & reference_usable
+    confidence = jnp.where(moving.mask, confidence[-1], 0)
+    # With weights that diverged all is NaN, or the identity for want of any weight.
+    valid &= all_finite((*transform, confidence, without_padding(copies[-1], moving.mask)))
     transform = rigid.identity_unless(valid, transform)
-    confidence = jnp.where(moving.mask & valid, confidence[-1], 0)
+    confidence = jnp.where(valid, confidence, 0)
     matrix = rigid.to_matrix(transform)
     return Registration(*transform, matrix, confidence, copies[-1], valid)

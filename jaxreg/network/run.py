@@ -2,6 +2,10 @@
 
 from typing import Any
 
+import jax
+
+from jaxreg.network.features import BATCH_AXIS
+
 Variables = dict[str, Any]
 
 
@@ -11,7 +15,8 @@ def run_network(
     """Apply a network; returns its output and `variables` with the statistics it updated.
 
     Raises:
-      ValueError: `variables` are those of another network.
+      ValueError: `variables` are those of another network, or `train` without the `vmap` axis
+        `features.BATCH_AXIS`, over which it takes the statistics.
     """
     if lacking := [kind for kind, tree in variables.items() if name not in tree]:
         raise ValueError(
@@ -21,6 +26,13 @@ def run_network(
     own = {kind: tree[name] for kind, tree in variables.items()}
     if not train:
         return module.apply(own, *inputs, train=False), variables
+    try:
+        jax.lax.axis_index(BATCH_AXIS)
+    except NameError:
+        raise ValueError(
+            "training takes the statistics of a batch: call it under jax.vmap(..., "
+            f"axis_name={BATCH_AXIS!r})."
+        ) from None
     output, updated = module.apply(own, *inputs, train=True, mutable=["batch_stats"])
     statistics = variables["batch_stats"] | {name: updated["batch_stats"]}
     return output, variables | {"batch_stats": statistics}

@@ -19,6 +19,7 @@ import numpy as np
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.config import CEMNetConfig, Config
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import nearest_in, squared_distances
@@ -63,6 +64,7 @@ class _SamplingNetwork(nn.Module):
         return nn.sigmoid(nn.Dense(6)(x))[0]
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],
@@ -355,7 +357,8 @@ def _over_all(moved: tuple[Float[Array, "n c"], ...], others: PointCloud, closer
                 found = closer(found, distance, first + i)
             return found, None
 
-        return jax.lax.scan(compare, jnp.broadcast_to(start, (lanes,)), (groups, first))[0]
+        so_far = varying_like(jnp.broadcast_to(start, (lanes,)), block[0, 0] + points[0, 0])
+        return jax.lax.scan(compare, so_far, (groups, first))[0]
 
     blocks = jnp.moveaxis(flat.reshape(3, -1, lanes), 1, 0)
     return jax.lax.map(of_block, blocks).reshape(-1)[:count].reshape(shape)

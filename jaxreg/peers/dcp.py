@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.config import Config, DCPConfig
 from jaxreg.geometry.procrustes import weighted_procrustes
 from jaxreg.network.features import DGCNN
@@ -21,6 +22,7 @@ from jaxreg.types import PointCloud, Registration
 _BN_MOMENTUM = 0.9
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.config import Config, FMRConfig
 from jaxreg.geometry import rigid, se3
 from jaxreg.geometry.neighbors import nearest_in, without_padding
@@ -75,6 +76,7 @@ class _Decoder(nn.Module):
         return nn.tanh(nn.Dense(3 * self.points)(x)).reshape(self.points, 3)
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],
@@ -166,7 +168,8 @@ def align_features(
 
     # An iteration is computed again in the backward pass: its layers are the most memory by far.
     iteration = jax.checkpoint(iteration, prevent_cse=False)
-    start = rigid.identity(source.points.dtype)
+    like = source.points[0, 0] + reference.points[0, 0]
+    start = jax.tree.map(lambda x: varying_like(x, like), rigid.identity(like.dtype))
     pose, errors = jax.lax.scan(iteration, start, length=config.iterations)
     errors = jnp.append(errors, jnp.sum(residual(pose) ** 2))
     before, after = (

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh
 from jaxreg.config import Config, IDAMConfig
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import knn, nearest_in
@@ -132,6 +133,7 @@ def distance_augmented(source: Kept, reference: Kept) -> Float[Array, "k l d"]:
     return jnp.concatenate([first, second, distance, direction], axis=-1)
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],
@@ -164,7 +166,7 @@ def register(
         kept.append(Kept(rows, PointCloud(cloud.points[rows], mask), features[rows]))
     *_, last = _steps(variables, *kept, config=config, train=False)[0]
     every = clouds[0].mask.astype(clouds[0].points.dtype)
-    plain = pair.registration(last.transform, *clouds, every)
+    plain = pair.registration(last.transform, *clouds, every, scores=(last.scores, last.validity))
     rows = jnp.where(kept[0].cloud.mask, kept[0].rows, clouds[0].mask.shape[0])
     matched = kept[1].cloud.points[last.columns]
     confidence = jnp.zeros_like(plain.confidence).at[rows].set(last.weights, mode="drop")

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.config import Config
 from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, nearest_in, without_padding
+from jaxreg.geometry.numerics import all_finite
 from jaxreg.types import PointCloud, Registration, RigidTransform
 
 _Settings = TypeVar("_Settings")
@@ -66,17 +67,24 @@ def registration(
     reference: PointCloud,
     confidence: Float[Array, "n"],
     correspondences: Float[Array, "n 3"] | None = None,
+    *,
+    scores: Any = None,
 ) -> Registration:
     """The record of a pose; the identity if a cloud has no valid point.
 
-    A method without correspondences gets the reference points nearest to the moved source.
+    Also if a number of it, or of the `scores` (a tree of arrays) behind it, is not finite, as with
+    weights that diverged. A method without correspondences gets the reference points nearest to the
+    moved source.
     """
+    confidence = jnp.where(source.mask, confidence, 0)
+    copies = None if correspondences is None else without_padding(correspondences, source.mask)
     valid = jnp.any(source.mask) & jnp.any(reference.mask)
+    valid &= all_finite((*transform, confidence, copies, scores))
     transform = rigid.identity_unless(valid, transform)
     if correspondences is None:
         moved = rigid.apply(transform, source.points)
         correspondences = reference.points[nearest_in(moved, reference.points, reference.mask)]
-    confidence = jnp.where(source.mask & valid, confidence, 0)
+    confidence = jnp.where(valid, confidence, 0)
     matrix = rigid.to_matrix(transform)
     return Registration(*transform, matrix, confidence, correspondences, valid)
 

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxreg._xla import on_any_mesh, varying_like
 from jaxreg.config import Config, RPMNetConfig
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import knn, squared_distances
@@ -132,6 +133,7 @@ class _FeatureNetwork(nn.Module):
         return x / jnp.where(length > 0, length, 1)
 
 
+@on_any_mesh
 def register(
     variables: Variables,
     source: Float[Array, "n 3"],
@@ -205,7 +207,8 @@ def _steps(
 
     # A step is computed again in the backward pass: its features are the most memory by far.
     step = jax.checkpoint(step, prevent_cse=False)
-    start = rigid.identity(source.points.dtype)
+    like = source.points[0, 0] + reference.points[0, 0]
+    start = jax.tree.map(lambda x: varying_like(x, like), rigid.identity(like.dtype))
     return jax.lax.scan(step, start, length=iterations)[1]
 
 

@@ -30,7 +30,8 @@ def icp(
     Every iteration pairs each moved source point with its nearest reference point and solves
     ``min sum_i w_i |R x_i + t - y_i|^2`` in closed form. ``w_i`` is 1, or the weight of the kernel
     at the pair's distance over its width; 0 beyond the largest distance and outside the trimmed
-    share. If no pair is left, the pose stays as it is, so no overlap gives `initial`.
+    share. If no pair is left, the pose stays as it is, so no overlap gives `initial`. Of a matrix in
+    `initial` that is no rotation (a mirror, zeros) the nearest rotation is taken.
 
     `max_correspondence_distance` and `kernel_scale`, the width of the kernel (None: taken from the
     distances themselves), have the unit of the clouds, may be traced arrays, and override `config`.

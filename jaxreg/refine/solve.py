@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg._xla import varying_like
 from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.geometry.numerics import safe_sqrt
+from jaxreg.geometry.procrustes import special_procrustes
 from jaxreg.geometry.small_linear import singular_vectors
 from jaxreg.refine.config import RefineConfig, check_options
 from jaxreg.refine.correspondences import Pairs, closest_pairs, with_neighbors
@@ -24,6 +25,8 @@ from jaxreg.types import Refinement, RigidTransform
 
 _LEAST_PULL = 1e-3
 """If an iteration takes back less than this share of a motion, the pairs leave the motion free."""
+_ORTHOGONAL = 1e-3
+"""Largest entry of ``R^T R - I`` in a start that stays as it is: rounding, half precision's as well."""
 
 
 class Problem(NamedTuple):
@@ -55,7 +58,7 @@ def set_up(
     """
     check_options(config)
     if initial is not None:
-        initial = arguments.transform("initial", initial)
+        initial = _rotating(arguments.transform("initial", initial))
     where, x, y = frame.enter(source, reference, source_mask, reference_mask)
     if max_correspondence_distance is None:
         max_correspondence_distance = config.max_correspondence_distance
@@ -67,6 +70,20 @@ def set_up(
     scene = Scene(x, y, None, None, weighting.in_units_of(where.length))
     start = frame.transform_in(where, initial)
     return Problem(where, start, scene, source_mask, reference_mask)
+
+
+def _rotating(start: RigidTransform) -> RigidTransform:
+    """The start, or what turns like it where its matrix is no rotation: the nearest one; NaN stays.
+
+    A step turns the pose it starts from, so a mirror would remain one, and zeros would remain zeros;
+    what is only known in a compiled program cannot be an error.
+    """
+    rotation = jnp.asarray(start.rotation)
+    gram = jnp.matmul(rotation.T, rotation, precision=Precision.HIGHEST)
+    unlike = jnp.max(jnp.abs(gram - jnp.eye(3, dtype=gram.dtype))) > _ORTHOGONAL
+    mirrored = jnp.sum(rotation[0] * jnp.cross(rotation[1], rotation[2])) < 0
+    nearest = special_procrustes(rotation.T)
+    return start._replace(rotation=jnp.where(unlike | mirrored, nearest, rotation))
 
 
 def solve(problem: Problem, method: Method, *, config: RefineConfig) -> Refinement:

@@ -30,6 +30,9 @@ _CUT, _GRID = 3.0, 0.5
 _COARSE, _DIGITS = 0.2, 5e4
 """So are still smaller ones where the numbers have five or six digits alone."""
 _REPEATED = 0.2
+_TWIN = 1e-3
+"""Share of the distance to the 4th nearest point: a nearer one is a copy, rounded in another way. Of
+points at random on a surface one in a million has such a neighbour, on a line one in a hundred."""
 _UNEVEN = 100.0
 
 
@@ -37,8 +40,8 @@ def findings(points: Float[np.ndarray, "n 3"]) -> list[str]:
     """Sentences on one cloud of finite points; none where nothing is odd.
 
     Strays; of all other points coordinates cut to steps, by few digits or by single precision at a
-    large offset; many repeated points; two-dimensional, planar, thin clouds; a density that varies
-    a hundredfold.
+    large offset; many repeated points, or copies with other digits; two-dimensional, planar, thin
+    clouds; a density that varies a hundredfold.
     """
     far = strays.strays(points)
     told = [strays.told(points, far)] if far.any() else []
@@ -47,10 +50,17 @@ def findings(points: Float[np.ndarray, "n 3"]) -> list[str]:
     if len(distinct) < 3:
         return [f"only {len(distinct)} distinct points: a pose needs 3"]
     repeated = 1 - len(distinct) / len(points)
-    near = _neighbours(distinct)
+    nearest, near = _neighbours(distinct)
     told += _steps(distinct, float(np.median(near)), repeated)
     if repeated > _REPEATED:
         told.append(f"{repeated:.0%} of the points repeat others: was the file written twice?")
+    twins = nearest < _TWIN * near
+    if np.mean(twins) > _REPEATED:
+        told.append(
+            f"{np.mean(twins):.0%} of the points nearly coincide with another, "
+            f"{nearest[twins].max():.2g} away or less: does the file hold a scan twice, once with "
+            "fewer digits?"
+        )
     return [*told, *_shape(distinct), *_density(near)]
 
 
@@ -95,12 +105,13 @@ def _size(points: np.ndarray) -> float:
     return 2 * float(np.median(np.linalg.norm(points - centre, axis=1)))
 
 
-def _neighbours(distinct: np.ndarray) -> np.ndarray:
-    """Of a sample, the distance to the 4th nearest other point."""
+def _neighbours(distinct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of a sample, the distances to the nearest other point and to the 4th nearest."""
     some = distinct[:: max(1, len(distinct) // _SAMPLE)]
     middle = distinct.mean(axis=0)
     tree, k = trees.Tree(distinct - middle), min(5, len(distinct))
-    return trees.neighbors(tree, some - middle, k)[0][:, -1]
+    distances = trees.neighbors(tree, some - middle, k)[0]
+    return distances[:, 1], distances[:, -1]
 
 
 def _steps(distinct: np.ndarray, spacing: float, repeated: float) -> list[str]:

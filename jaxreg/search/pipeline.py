@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._xla import on_any_mesh
 from jaxreg.geometry import arguments, frame, rigid
+from jaxreg.geometry.numerics import all_finite
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.methods import refine
 from jaxreg.search.config import SearchConfig
@@ -50,6 +51,7 @@ def register_global(
     search is discrete.
 
     A cloud with a point that is not finite counts as empty: `valid` is False, the pose the identity.
+    So it is where the similarity of two points, or a weight of the network, is not finite.
 
     `max_angle` (radians) bounds the rotation, which decides between the poses of a symmetric shape;
     if the search finds no pose within it, the best of all is returned. `score` is
@@ -60,7 +62,9 @@ def register_global(
         the similarity has another shape or dtype, `max_angle` is not in (0, pi], or `network` was
         trained for other radii.
     """
-    where, clouds, described = _described(source, reference, source_mask, reference_mask, config)
+    where, clouds, described = _described(
+        source, reference, source_mask, reference_mask, similarity, network, config
+    )
     found = search_described(
         *described, network=network, similarity=similarity, max_angle=max_angle, config=config
     )
@@ -88,7 +92,9 @@ def search_poses(
 
     `also`: one more pose to try. Poses that turn by more than `max_angle` (radians) are not allowed.
     """
-    where, _, described = _described(source, reference, source_mask, reference_mask, config)
+    where, _, described = _described(
+        source, reference, source_mask, reference_mask, similarity, network, config
+    )
     if also is not None:
         also = frame.transform_in(where, arguments.transform("also", also))
     found = search_described(
@@ -107,13 +113,24 @@ def _described(
     reference: Array,
     source_mask: Array | None,
     reference_mask: Array | None,
+    similarity: Array | None,
+    network: Network | None,
     config: SearchConfig,
 ) -> tuple[frame.Frame, tuple[Array, Array], tuple[Described, Described]]:
-    """The frame of two checked clouds, their points in it, and what the search compares."""
+    """The frame of two checked clouds, their points in it, and what the search compares.
+
+    Features that are not finite say of no point what it is like, so that the source counts as empty.
+    """
     arguments.settings("config", config, SearchConfig)
     source, reference = arguments.clouds(source, reference)
     source_mask = arguments.usable("source_mask", source, source_mask)
     reference_mask = arguments.usable("reference_mask", reference, reference_mask)
+    if similarity is not None:
+        shape = source.shape[0], reference.shape[0]
+        similarity = arguments.rows("similarity", similarity, shape, source)
+        both = source_mask[:, None] & reference_mask[None, :]
+        source_mask &= all_finite(jnp.where(both, similarity, 0))
+    source_mask &= all_finite(network)
     where, x, y = enter(source, reference, source_mask, reference_mask, unit=config.unit)
     one = describe(x, source_mask, unit=1.0, config=config)
     other = describe(y, reference_mask, unit=1.0, config=config)

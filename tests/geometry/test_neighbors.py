@@ -121,6 +121,12 @@ def test_large_clouds_are_searched_in_blocks_of_rows(rng):
     assert needed < 16_384**2 * 4 / 2
 
 
+def test_few_points_are_searched_in_blocks_among_many_others(rng):
+    points, others = rng.normal(size=(1100, 3)), rng.normal(size=(70_000, 3))
+    _, expected = cKDTree(others).query(points)
+    np.testing.assert_array_equal(nearest_in(points, others), expected)
+
+
 def test_squared_distances_entry_by_entry(rng):
     points, others = rng.normal(size=(4, 3)), rng.normal(size=(6, 3))
     expected = [[np.sum((p - q) ** 2) for q in others] for p in points]

@@ -108,3 +108,10 @@ def test_leading_max_is_numpy_s_and_hands_its_derivative_to_the_largest(count, s
     x[0] = x[-1] = 9.0
     gradient = jax.grad(lambda x: numerics.leading_max(x).sum())(jnp.asarray(x))
     np.testing.assert_allclose(np.sum(gradient, axis=0), 1.0, rtol=1e-15)
+
+
+def test_one_number_that_is_not_finite_is_found_in_a_tree():
+    assert numerics.all_finite({"a": np.ones(3), "b": (np.zeros((2, 2)), None)})
+    assert numerics.all_finite(())
+    for odd in (np.nan, np.inf, -np.inf):
+        assert not numerics.all_finite({"a": np.ones(3), "b": (np.array([[0, odd]]), None)})

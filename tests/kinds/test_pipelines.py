@@ -244,14 +244,9 @@ NO_ROTATIONS = {
     for method in ("icp", "point_to_plane", "gicp")
     for name in rotations()
 }
-KEPT_WRONG = {
-    name: "a matrix that is no rotation comes back as none: determinant 0 or -1"
-    for name, (method, kind) in NO_ROTATIONS.items()
-    if method != "icp" and kind in ("zeros", "mirror", "twice")
-}
 
 
-@pytest.mark.parametrize("name", members(NO_ROTATIONS, KEPT_WRONG))
+@pytest.mark.parametrize("name", members(NO_ROTATIONS))
 def test_a_start_that_is_no_rotation_is_refused_or_does_no_harm(name):
     method, kind = NO_ROTATIONS[name]
     start = RigidTransform(rotations()[kind].astype(np.float32), np.zeros(3, np.float32))
@@ -292,10 +287,31 @@ def test_a_row_without_weight_changes_nothing(name):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="`valid` is True, as if NaN were features")
 def test_similarities_of_a_network_that_diverged_are_not_valid():
     found = jax.jit(jaxreg.register_global)(X, Y, similarity=jnp.full((N, N), jnp.nan))
     assert not found.valid
+    np.testing.assert_array_equal(found.transformation, np.eye(4))
+
+
+@pytest.mark.slow
+def test_features_of_a_network_that_diverged_are_not_valid():
+    network = dict(jaxreg.load_features())
+    network["near_edge"] = np.full_like(network["near_edge"], np.nan)
+    assert not jax.jit(jaxreg.register_global)(X, Y, network=network).valid
+
+
+@pytest.mark.parametrize("name", ["paper", *LEARNED])
+def test_a_network_whose_weights_diverged_finds_nothing_valid(name):
+    config = Config(network=name, model=SMALL)
+
+    def run(x, y):
+        variables = by_name.init_variables(jax.random.key(0), config)
+        diverged = jax.tree.map(lambda w: w * jnp.nan, variables["params"])
+        return by_name.register(variables | {"params": diverged}, x, y, config=config)
+
+    found = jax.jit(run)(X, Y)
+    assert not found.valid
+    np.testing.assert_array_equal(found.transformation, np.eye(4))
 
 
 SOLVED = {
@@ -380,13 +396,7 @@ def test_other_networks_refuse_wrong_arrays(name):
         jax.eval_shape(run, source, mask)
 
 
-ALONE = {
-    "idam": "NameError: Found an unbound axis name: batch",
-    "fmr": "NameError: Found an unbound axis name: batch",
-}
-
-
-@pytest.mark.parametrize("name", members(["idam", "rpmnet", "fmr"], ALONE))
+@pytest.mark.parametrize("name", members(["idam", "rpmnet", "fmr"]))
 def test_a_loss_outside_of_a_batch_works_or_says_what_to_do(name):
     try:
         jax.eval_shape(peer_loss(name), shape(N, 3))
@@ -596,23 +606,11 @@ MESHED = {
     ).rotation
     for name in LEARNED
 }  # fmt: skip
-IN_SHARD_MAP = {
-    "optimize_poses": "TypeError: scan body function carry input and carry output must be equal",
-    "rpmnet": "TypeError: the carry start.rotation is not varying over the mesh",
-    "fmr": "TypeError: the carry pose.rotation is not varying over the mesh",
-    "cemnet": "TypeError: the carry found is not varying over the mesh",
-}
-ON_EXPLICIT_AXES = {
-    "optimize_poses": "ShardingTypeError: all operands should have the same sharding",
-    "rpmnet": "ShardingTypeError: this reshape is not supported",
-    "idam": "ShardingTypeError: all operands should have the same sharding",
-    "fmr": "ShardingTypeError: all operands should have the same sharding",
-}
 PAIRS = PartitionSpec("pairs")
 
 
 @pytest.mark.loose
-@pytest.mark.parametrize("name", members(MESHED, IN_SHARD_MAP))
+@pytest.mark.parametrize("name", members(MESHED))
 def test_shard_map_with_its_check_is_traced(name):
     """Types are checked on a mesh of one device as on one of many."""
     mesh = jax.make_mesh((1,), ("pairs",), axis_types=(AxisType.Auto,))
@@ -622,7 +620,7 @@ def test_shard_map_with_its_check_is_traced(name):
 
 
 @pytest.mark.loose
-@pytest.mark.parametrize("name", members(MESHED, ON_EXPLICIT_AXES))
+@pytest.mark.parametrize("name", members(MESHED))
 def test_a_mesh_of_explicit_axes_is_traced(name):
     mesh = jax.make_mesh((1,), ("pairs",))
     clouds = jax.ShapeDtypeStruct((2, N, 3), np.float32, sharding=NamedSharding(mesh, PAIRS))
@@ -702,19 +700,23 @@ UNDER = {
         lambda a: jax.lax.map(lambda b: call(b, x).rotation, a), shape(2, N, 3)
     ),
 }
-UNDER_FAULTS = {
-    "vmap": "NotImplementedError: Batching rule for 'call_exported' not implemented; no word of a loop",
-    "grad": "ValueError: No VJP is available; no word that the program was saved without one",
-}
 
 
-@pytest.mark.parametrize("name", members(UNDER, UNDER_FAULTS))
+@pytest.mark.parametrize("name", members(UNDER))
 def test_a_loaded_program_composes_or_says_what_to_do(name):
     call = jaxreg.load_exported(PROGRAM)
     try:
         UNDER[name](call, jnp.asarray(X))
     except ValueError as error:
         assert re.search("map_pairs|lax.map|jaxreg export|register_global", str(error))  # noqa: PT017
+
+
+def test_a_batch_of_a_loaded_program_is_what_its_copy_gives_pair_by_pair():
+    program = jaxreg.load_exported(PROGRAM)
+    again = pickle.loads(pickle.dumps(program))
+    found = jax.vmap(program, in_axes=(0, None))(FRAMES, Y)
+    for frame, transformation in zip(FRAMES, found.transformation, strict=True):
+        np.testing.assert_allclose(again(frame, Y).transformation, transformation, atol=1e-5)
 
 
 def test_records_settings_and_prepared_scans_survive_pickling():
@@ -747,10 +749,6 @@ def assert_same(one, other):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="AttributeError: Can't pickle local object '_cpp_pjit.<locals>.cache_miss'",
-)
 def test_a_loaded_program_goes_to_a_worker_or_says_how():
     program = jaxreg.load_exported(PROGRAM)
     try:
@@ -844,14 +842,10 @@ MISTYPED = {
     "more test points kept than there are": (["c.toml", "--test-pairs.kept", "40"], None, "kept"),
     "fewer test points kept than inliers": (["c.toml", "--test-pairs.kept", "10"], None, "inliers"),
 }  # fmt: skip
-MISTYPED_FAULTS = dict.fromkeys(
-    ("more test points kept than there are", "fewer test points kept than inliers"),
-    "it trains until the first validation, hours later, and ends there",
-)
 
 
 @pytest.mark.loose
-@pytest.mark.parametrize("name", members(MISTYPED, MISTYPED_FAULTS))
+@pytest.mark.parametrize("name", members(MISTYPED))
 def test_what_is_mistyped_is_refused_before_the_training(tmp_path, shell, name):
     arguments, content, told = MISTYPED[name]
     if content:
@@ -951,13 +945,9 @@ MEMORY = {
     "a submap in a map": (lambda x, y: jaxreg.icp(x, y, config=FEW), clouds_of(2048, 200_000)),
     "normals of a map": (lambda x, y: jaxreg.normals(x, jaxreg.knn(x, 20)), clouds_of(200_000, 1)),
 }  # fmt: skip
-TOO_MUCH = {
-    "a submap in a map": "3 GB: blocks of 2048 rows, however wide they are",
-    "normals of a map": "1.6 GB: blocks of 2048 rows, however wide they are",
-}
 
 
-@pytest.mark.parametrize("name", members(MEMORY, TOO_MUCH))
+@pytest.mark.parametrize("name", members(MEMORY))
 def test_memory_of_large_clouds_stays_below_a_gigabyte(name):
     function, arguments = MEMORY[name]
     compiled = jax.jit(function).lower(*arguments).compile()
@@ -990,11 +980,6 @@ def test_a_handful_of_programs_serve_clouds_of_every_size(caplog, name):
     assert len(found) <= most
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="68 programs for 400 pairs of 300 to 3000 points, and more for more: one for every pair of "
-    "sizes that differ by more than twice",
-)
 def test_a_stream_of_pairs_of_every_size_needs_thirty_programs(monkeypatch):
     seen = set()
 

@@ -329,3 +329,23 @@ def test_copies_correspond_in_batches_too(method, seed):
     result = jax.jit(jax.vmap(partial(eager_refine, config=config)))(jnp.asarray(x), y)
     np.testing.assert_allclose(result.correspondences, y, atol=1e-12)
     np.testing.assert_allclose(result.confidence, 1, atol=1e-12)
+
+
+@each_method
+@pytest.mark.parametrize("stretched", ["sheared", "mirrored", "not finite"])
+def test_of_a_start_that_is_no_rotation_the_nearest_rotation_is_taken(method, stretched):
+    """As no point has a partner, the start is the result; the nearest rotation is that of the SVD."""
+    source, reference = make_pair(4)
+    turn = Rotation.from_euler("xyz", [40, -20, 10], degrees=True).as_matrix()
+    stretch = {"sheared": np.eye(3) + np.eye(3, k=1), "mirrored": np.diag([1, 2, -3.0])}
+    matrix = turn @ stretch.get(stretched, np.full((3, 3), np.nan))
+    start = RigidTransform(jnp.asarray(matrix), jnp.array([1.0, 2, 3]))
+    config = RefineConfig(method, iterations=3, max_correspondence_distance=1e-9)
+    found = refine(source, reference, initial=start, config=config)
+    if stretched == "not finite":
+        assert np.isnan(found.rotation).all()
+        return
+    u, _, vt = np.linalg.svd(matrix)
+    nearest = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    np.testing.assert_allclose(found.rotation, nearest, atol=1e-6)
+    np.testing.assert_allclose(found.translation, start.translation, atol=1e-6)

@@ -54,6 +54,9 @@ def core_rows() -> dict[str, Row]:
             numerics.safe_sqrt, (RNG.uniform(1, 2, 4),), ((np.array([0.0, -1]),),)
         ),
         "geometry.numerics.safe_norm": Row(numerics.safe_norm, (points(),), ((np.zeros((2, 3)),),)),
+        "geometry.numerics.all_finite": Row(
+            numerics.all_finite, (np.ones((2, 3)),), ((np.array([0.0, 1e300]),),), smooth=False
+        ),
         "geometry.numerics.leading_max": Row(
             numerics.leading_max,
             (points(),),
