@@ -97,10 +97,12 @@ class Agreement(NamedTuple):
     def explains(self, other: "Agreement") -> bool:
         """Whether this is a far better fit than the other, to the noise or nearer to it."""
         to_the_noise = self.spread <= max(other.spread, _SPREAD)
-        better = self.off <= _BETTER * other.off or (
-            other.drawn and self.off <= other.off and self.spread <= _NEARER * other.spread
-        )
-        return self.compared >= 0.9 * other.compared and better and to_the_noise
+        fewer_off = self.off <= _BETTER * other.off
+        return self.compared >= 0.9 * other.compared and fewer_off and to_the_noise
+
+    def brings_nearer(self, other: "Agreement") -> bool:
+        """Whether nothing fitted to the noise before, and this fits much nearer to it."""
+        return other.drawn and self.off <= other.off and self.spread <= _NEARER * other.spread
 
 
 def agreement(
@@ -223,7 +225,8 @@ def slight_size_text(scale: float) -> str:
 
 def size_text(scale: float, now: Agreement, then: Agreement) -> str:
     """A sentence on the size at which the source fits; empty if it is its own."""
-    if abs(np.log(scale)) < _SIZES or not then.explains(now):
+    better = then.explains(now) or then.brings_nearer(now)
+    if abs(np.log(scale)) < _SIZES or not better:
         return ""
     return f"The source fits at {scale:.3f} of its size."
 
