@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from jaxreg._xla import on_any_mesh, varying_like
+from jaxreg._xla import on_any_mesh
 from jaxreg.config import Config, FMRConfig
 from jaxreg.geometry import rigid, se3
 from jaxreg.geometry.neighbors import nearest_in, without_padding
@@ -168,8 +168,7 @@ def align_features(
 
     # An iteration is computed again in the backward pass: its layers are the most memory by far.
     iteration = jax.checkpoint(iteration, prevent_cse=False)
-    like = source.points[0, 0] + reference.points[0, 0]
-    start = jax.tree.map(lambda x: varying_like(x, like), rigid.identity(like.dtype))
+    start = pair.identity_of(source, reference)
     pose, errors = jax.lax.scan(iteration, start, length=config.iterations)
     errors = jnp.append(errors, jnp.sum(residual(pose) ** 2))
     before, after = (

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._xla import varying_like
 from jaxreg.config import Config
 from jaxreg.geometry import arguments, rigid
 from jaxreg.geometry.neighbors import knn, nearest_in, without_padding
@@ -59,6 +60,12 @@ def in_dtype(variables: Any, dtype: Any) -> Any:
             "parameters and statistics."
         )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), variables)
+
+
+def identity_of(source: PointCloud, reference: PointCloud) -> RigidTransform:
+    """The pose that steps start from: it varies over a mesh as both clouds do."""
+    like = source.points[0, 0] + reference.points[0, 0]
+    return jax.tree.map(lambda x: varying_like(x, like), rigid.identity(like.dtype))
 
 
 def registration(

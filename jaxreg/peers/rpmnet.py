@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from jaxreg._xla import on_any_mesh, varying_like
+from jaxreg._xla import on_any_mesh
 from jaxreg.config import Config, RPMNetConfig
 from jaxreg.geometry import rigid
 from jaxreg.geometry.neighbors import knn, squared_distances
@@ -207,8 +207,7 @@ def _steps(
 
     # A step is computed again in the backward pass: its features are the most memory by far.
     step = jax.checkpoint(step, prevent_cse=False)
-    like = source.points[0, 0] + reference.points[0, 0]
-    start = jax.tree.map(lambda x: varying_like(x, like), rigid.identity(like.dtype))
+    start = pair.identity_of(source, reference)
     return jax.lax.scan(step, start, length=iterations)[1]
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxreg._xla import from_host
 from jaxreg.geometry.rigid import nearest_rotation, rotation_angle_deg
@@ -207,13 +207,20 @@ def merged(one: Judged, other: Judged) -> Judged:
     return ranked(*jax.tree.map(lambda a, b: np.concatenate([a, b]), one, other))
 
 
+def are_apart(poses: RigidTransform, other: RigidTransform) -> Bool[np.ndarray, "*k"]:
+    """Whether poses, in the unit of the frame, are not `other` but for noise."""
+    turned = rotation_angle_deg(poses.rotation, other.rotation)
+    moved = np.linalg.norm(poses.translation - other.translation, axis=-1)
+    return (turned > APART_DEG) | (moved > APART)
+
+
 def _distinct(poses: RigidTransform, score: np.ndarray, most: int) -> list[int]:
     chosen: list[int] = []
     for i in np.argsort(-score, kind="stable").tolist():
         if len(chosen) == most:
             break
-        turned = rotation_angle_deg(poses.rotation[chosen], poses.rotation[i][None])
-        moved = np.linalg.norm(poses.translation[chosen] - poses.translation[i], axis=1)
-        if np.all((turned > APART_DEG) | (moved > APART)):
+        others = RigidTransform(poses.rotation[chosen], poses.translation[chosen])
+        one = RigidTransform(poses.rotation[i : i + 1], poses.translation[i : i + 1])
+        if np.all(are_apart(others, one)):
             chosen.append(i)
     return chosen

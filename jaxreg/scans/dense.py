@@ -218,8 +218,8 @@ def stretched(
     return sizes, agreement(source, reference, pose, right.T @ np.diag(sizes) @ right)
 
 
-def slight_size_text(scale: float) -> str:
-    """A sentence on the size that `slight_size` found."""
+def at_size_text(scale: float) -> str:
+    """A sentence on the size at which the source fits."""
     return f"The source fits at {scale:.3f} of its size."
 
 
@@ -228,7 +228,7 @@ def size_text(scale: float, now: Agreement, then: Agreement) -> str:
     better = then.explains(now) or then.brings_nearer(now)
     if abs(np.log(scale)) < _SIZES or not better:
         return ""
-    return f"The source fits at {scale:.3f} of its size."
+    return at_size_text(scale)
 
 
 def stretch_text(sizes: Float[np.ndarray, "3"], now: Agreement, then: Agreement) -> str:
@@ -256,8 +256,7 @@ def _in_radii(
     moving: Prepared, fixed: Prepared, pose: RigidTransform, count: int
 ) -> tuple[Float[np.ndarray, "p 3"], RigidTransform, float]:
     """Points of a cloud, a pose of centred clouds, and the noise, in radii of the fixed cloud."""
-    rows = np.linspace(0, len(moving.points) - 1, min(count, len(moving.points))).astype(int)
-    some = moving.points[rows] * (moving.radius / fixed.radius)
+    some = moving.points[moving.rows(count)] * (moving.radius / fixed.radius)
     shift = pose.translation / fixed.radius
     return some, RigidTransform(pose.rotation, shift), stable.noise(moving, fixed, _SHOWN)[0]
 
@@ -283,8 +282,7 @@ def _sized(
         # A smaller cloud has fewer points beyond where the other ends, which says nothing of its size.
         both = now.over & found.over
         then, before = (
-            np.minimum(np.abs(one.off[both]) / (_LIMIT * noise), 1)[None] ** 2
-            for one in (found, now)
+            planes.capped(one.off[both], np.array([_LIMIT * noise])) for one in (found, now)
         )
         errors = -float(planes.errors_worse(then, before)[0]) if both.any() else -np.inf
         if errors > better:
@@ -300,8 +298,7 @@ def _widths(noise: Float[np.ndarray, "p"], reach: float) -> Float[np.ndarray, "i
 
 def _sampled(cloud: Prepared, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points of the cloud about its centre in the unit of the input, and the noise there."""
-    rows = np.linspace(0, len(cloud.points) - 1, min(count, len(cloud.points))).astype(int)
-    points = cloud.points[rows]
+    points = cloud.points[cloud.rows(count)]
     noise = planes.patches(cloud.points, cloud.tree, points).noise
     return points * cloud.radius, noise * cloud.radius
 

@@ -15,7 +15,7 @@ from jaxreg.judge.odds import chances as chances_of
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import triples
 from jaxreg.scans.dense import MIRRORED
-from jaxreg.scans.known import UP, Known
+from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
 from jaxreg.scans.result import (
     LISTED,
@@ -38,8 +38,6 @@ _TRUSTED, _RIVAL = 0.5, 0.1
 """The probability of a success, and that of all other poses which forbids one."""
 _FREE = 0.1
 """Standard deviation of the rotation, in radians, from which the points leave it free."""
-_FLAT = 1e-9
-"""Clouds less thick than this are in a plane of one z, in which a turn is about z."""
 _REACH = 3.0
 """Points within so many residuals of another count as the same."""
 
@@ -60,8 +58,8 @@ def registered(
     # Squares of lengths of any unit might not be finite.
     unit = max(source.radius, reference.radius)
     x, y = (cloud.points * (cloud.radius / unit) for cloud in clouds)
-    if all(np.ptp(points[:, 2]) <= _FLAT for points in (x, y)):
-        known = known._replace(up=UP)
+    if source.flat and reference.flat:
+        known = known.in_the_plane()
     solved = functools.partial(
         triples.solutions, up=known.up, max_rotation_deg=known.max_rotation_deg,
         initial=None if start is None else in_unit(centred(clouds, start), 1 / unit),

@@ -38,8 +38,6 @@ from jaxreg.types import RigidTransform
 
 MOTIONS = np.eye(6)[:, [2, 3, 4]]
 """The unknown ones: the turn in the plane and two shifts."""
-_FLAT = 1e-9
-"""Clouds less thick than this, in radii, are in a plane of one z."""
 _FEWEST = 20
 _JUDGED = 512
 """Points that the evidence is read at: a line of so many has about the spacing, beside its length, that
@@ -82,10 +80,7 @@ class Line(NamedTuple):
 
 def is_planar(source: Prepared, reference: Prepared) -> bool:
     """Whether all points of each cloud have one z, and there are enough to make lines."""
-    return all(
-        len(cloud.points) >= _FEWEST and np.ptp(cloud.points[:, 2]) <= _FLAT
-        for cloud in (source, reference)
-    )
+    return all(len(cloud.points) >= _FEWEST and cloud.flat for cloud in (source, reference))
 
 
 def registered(
@@ -297,18 +292,19 @@ def _cause(
     known: Known,
 ) -> str:
     """A sentence where many points lie off the other line: another size, a mirror image, or a doubt."""
-    now = _agreement(x, y, ratio, fit)
+    width = float(np.median(y.surface.next_to(y.points).width))
+    noise = max(_noise(x, y, ratio), planes.FLOOR * width, 1e-12)
+    now = _agreement(fit, noise)
     if now.compared < _COMPARED or (now.off < _SUSPECT and not now.drawn):
         return ""
     widths = np.geomspace(_START, planes.TUKEY * max(_noise(x, y, ratio), 1e-6), _NARROWING)
     sized = planes.fitted(x.points * ratio, y.surface, fit.pose, widths, motions=MOTIONS, scale=1.0)
-    if told := dense.size_text(sized.scale, now, _agreement(x, y, ratio, sized)):
+    if told := dense.size_text(sized.scale, now, _agreement(sized, noise)):
         return told
-    points = source.points * source.radius * [-1, 1, 1]
-    twin = _line(prepare.prepare(points, config=config))
+    twin = _line(prepare.mirrored(source, config))
     for other in _searched(twin, y, ratio, config, known):
         closed = _closed(twin, y, ratio, other.pose, config, None)
-        if _agreement(twin, y, ratio, closed).explains(now):
+        if _agreement(closed, noise).explains(now):
             return dense.MIRRORED
     if now.off < (_OTHER if now.comparable else _MOSTLY_OFF):
         return ""
@@ -318,10 +314,8 @@ def _cause(
     )
 
 
-def _agreement(x: Line, y: Line, ratio: float, fit: planes.Fitted) -> dense.Agreement:
+def _agreement(fit: planes.Fitted, noise: float) -> dense.Agreement:
     """How many of the points of a line lie beside the other, and how many of them off it."""
-    patches = y.surface.next_to(y.points)
-    noise = max(_noise(x, y, ratio), planes.FLOOR * float(np.median(patches.width)), 1e-12)
     off = np.abs(fit.off[fit.over])
     if not len(off):
         return dense.Agreement(0.0, 0.0, 0.0)

@@ -139,8 +139,13 @@ def misfit(
     """
     found = surface.next_to(points)
     off, beside = offsets(points, found)
-    off = np.where(beside < WITHIN * found.width, np.abs(off), np.inf)
-    return np.minimum(off / limits[:, None], 1) ** 2
+    off = np.where(beside < WITHIN * found.width, off, np.inf)
+    return capped(off, limits)
+
+
+def capped(off: Float[np.ndarray, "p"], limits: Float[np.ndarray, "l"]) -> Float[np.ndarray, "l p"]:
+    """Squared distances in units of each limit, 1 from there on."""
+    return np.minimum(np.abs(off) / limits[:, None], 1) ** 2
 
 
 def errors_worse(

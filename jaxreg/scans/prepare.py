@@ -26,6 +26,8 @@ from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.search.config import SearchConfig
 from jaxreg.search.description import Described, describe
 
+_FLAT = 1e-9
+"""Clouds less thick than this, in radii, are in a plane of one z."""
 _FOURTH = 4
 """The neighbour whose distance is the spacing; see `spacing`."""
 FINEST = 1e-6
@@ -116,6 +118,15 @@ class Prepared:
     def tree(self) -> trees.Tree:
         """Over all points."""
         return trees.Tree(self.points)
+
+    @property
+    def flat(self) -> bool:
+        """Whether all points have one z."""
+        return bool(np.ptp(self.points[:, 2]) <= _FLAT)
+
+    def rows(self, most: int) -> Int[np.ndarray, "s"]:
+        """Indices of at most so many points, evenly along their order."""
+        return np.linspace(0, len(self.points) - 1, min(most, len(self.points))).astype(int)
 
     @functools.cached_property
     def surface(self) -> planes.Surface:
@@ -245,6 +256,11 @@ def of_points(
     across = None if cloud.normals is None else cloud.normals[chosen]
     place = None if cloud.viewpoint is None else cloud.viewpoint * cloud.radius + cloud.centre
     return prepare(points, normals=across, viewpoint=place, strays="keep", config=config)
+
+
+def mirrored(cloud: Prepared, config: RegisterConfig) -> Prepared:
+    """The mirror image of a cloud, about its centre."""
+    return prepare(cloud.points * cloud.radius * [-1, 1, 1], config=config)
 
 
 def at_one_density(source: Prepared, reference: Prepared) -> tuple[Level, Level]:

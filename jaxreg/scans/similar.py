@@ -112,12 +112,11 @@ def _one_way(
     moving, fixed = clouds
     unit = fixed.radius
     inner = centred(clouds, pose)
-    rows = np.linspace(0, len(moving.points) - 1, min(_SAMPLE, len(moving.points))).astype(int)
     some = fixed.points[:: max(1, len(fixed.points) // 2000)]
     patches = planes.patches(fixed.points, fixed.tree, some)
     narrowest = min(planes.TUKEY * max(2 * float(np.median(patches.noise)), 1e-6), _REACH)
     return planes.fitted(
-        moving.points[rows] * (moving.radius / unit),
+        moving.points[moving.rows(_SAMPLE)] * (moving.radius / unit),
         planes.Surface(fixed.points, fixed.tree, count=8, flat=True) if flat else fixed.surface,
         RigidTransform(inner.rotation, inner.translation / unit),
         np.geomspace(_REACH, narrowest, _ITERATIONS),

@@ -87,7 +87,7 @@ def settled(
     unit, motions = reference.radius, known.motions
     finer = planes.Surface(reference.points, reference.tree, count=_NEIGHBORS)
     start = RigidTransform(pose.rotation, pose.translation / unit)
-    few, many = _rows(source, _FIRST), _rows(source, _SECOND)
+    few, many = source.rows(_FIRST), source.rows(_SECOND)
     first, second = (source.points[rows] * (source.radius / unit) for rows in (few, many))
     given = np.ones(len(source.points)) if known.weights is None else known.weights
     level, least = noise(source, reference)
@@ -148,15 +148,11 @@ def _narrowed(
     return fits[best] if agree[best] > _MORE * agree[0] else fits[0]
 
 
-def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
-    return np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int)
-
-
 def noise(source: Prepared, reference: Prepared, count: int = _FIRST) -> tuple[float, float]:
     """The median thickness of pieces of surface and its floor, in radii of the reference."""
     levels, widths = [], []
     for cloud in (source, reference):
-        found = cloud.surface.next_to(cloud.points[_rows(cloud, count)])
+        found = cloud.surface.next_to(cloud.points[cloud.rows(count)])
         levels.append(np.median(found.noise) * cloud.radius / reference.radius)
         widths.append(np.median(found.width) * cloud.radius / reference.radius)
     least = max(planes.FLOOR * float(max(widths)), _LEAST)

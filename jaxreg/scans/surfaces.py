@@ -318,7 +318,7 @@ def _slight_size(problem: Problem, pose: RigidTransform, now: dense.Agreement) -
         return ""
     reach = problem.reach() * float(problem.where.length)
     scale = dense.slight_size(problem.source, problem.reference, pose, reach)
-    return "" if scale is None else dense.slight_size_text(scale)
+    return "" if scale is None else dense.at_size_text(scale)
 
 
 def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement) -> str:
@@ -331,7 +331,7 @@ def _another_cause(problem: Problem, pose: RigidTransform, now: dense.Agreement)
     sizes, then = dense.stretched(source, reference, pose, reach)
     if told := dense.stretch_text(sizes, now, then):
         return told
-    mirrored = prepare.prepare(source.points * source.radius * [-1, 1, 1], config=config)
+    mirrored = prepare.mirrored(source, config)
     # Nearly all of both clouds overlap here, which needs no wider search.
     twin = pose_problem(mirrored, reference, dataclasses.replace(config, wide=None))
     other = refine_pose(twin, searched(twin).pose).transform
@@ -345,6 +345,7 @@ def finished(
     problem: Problem, found: Found, *, least: float = 0.0, thorough: bool = True
 ) -> ScanRegistration:
     """The chosen pose refined, looked at with all points, and judged beside the others."""
+    closely = thorough and found.probability >= least
     if found.probability < least:
         refined, closing = unrefined(found.pose), _Closing()
     else:
@@ -356,13 +357,13 @@ def finished(
     covariance = problem.known.conditional(_covariance(refined.uncertainty, length))
     hardly_held = weak_directions(problem.known.held(refined.uncertainty))
     settled, as_good = closing.settled, ()
-    if thorough and found.probability >= least:
+    if closely:
         pose = refined.transform if settled is None else in_unit(settled.pose, 1 / length)
         settled, as_good = _along_weak(problem, pose, hardly_held, settled)
     if settled is not None:
         covariance = settled.covariance
         refined = refined._replace(transform=in_unit(settled.pose, 1 / length))
-    if thorough and found.probability >= least:
+    if closely:
         covariance = _with_halves(problem, refined.transform, covariance)
     evidence, score = problem.clouds().judge(
         jax.tree.map(lambda leaf: leaf[None], refined.transform)
@@ -375,16 +376,11 @@ def finished(
     if judged.same > _SOME_SAME and not found.given and problem.motions is None:
         points = source.points * (source.radius / length)
         others = candidates.with_half_turns(problem.clouds(), points, refined.transform, others)
-    if as_good:
-        # Nothing tells these from the pose, so their odds are its own.
-        rivals = ((other, float(score[0])) for other in as_good)
+        others = tuple(pair for pair in others if _is_allowed(problem, pair[0]))
+    # Nothing tells these from the pose, so their odds are its own.
+    rivals = tuple((one, float(score[0])) for one in as_good if _is_allowed(problem, one))
+    if rivals:
         others = candidates.distinct_from(refined.transform, (*others, *rivals))
-    most = problem.known.max_rotation_deg + _ROUNDING_DEG
-    others = tuple(
-        (other, odds)
-        for other, odds in others
-        if rotation_angle_deg(other.rotation, np.eye(3)) <= most
-    )
     likelihood = chances(np.array([score[0], *(s for _, s in others)]))
     free = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
@@ -411,6 +407,12 @@ def finished(
         ),
         notes=closing.notes,
     )
+
+
+def _is_allowed(problem: Problem, pose: RigidTransform) -> bool:
+    """Whether a pose turns by no more than is known of the pair."""
+    turned = rotation_angle_deg(pose.rotation, np.eye(3))
+    return bool(turned <= problem.known.max_rotation_deg + _ROUNDING_DEG)
 
 
 def _along_weak(

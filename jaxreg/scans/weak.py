@@ -11,12 +11,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.refine.uncertainty import WeakDirection
 from jaxreg.scans import planes, stable
-from jaxreg.scans.candidates import APART, APART_DEG
+from jaxreg.scans.candidates import are_apart
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
 from jaxreg.types import RigidTransform
@@ -63,8 +62,7 @@ def elsewhere(
     noise, _ = stable.noise(source, reference, _FITTED)
     widths = np.geomspace(max(reach / unit, planes.TUKEY * noise), planes.TUKEY * noise, _NARROWING)
     few, many = (
-        source.points[_rows(source, count)] * (source.radius / unit)
-        for count in (_FITTED, _COMPARED)
+        source.points[source.rows(count)] * (source.radius / unit) for count in (_FITTED, _COMPARED)
     )
     start = RigidTransform(pose.rotation, pose.translation / unit)
 
@@ -81,7 +79,7 @@ def elsewhere(
     if planes.errors_worse(its_own, misfit).min() < -_BETTER:
         best, misfit, better = again, its_own, True
     others = [fitted(moved) for moved in _moved(best, weak, unit, largest)]
-    others = [(other, against(other)) for other in others if _apart(other, best)]
+    others = [(other, against(other)) for other in others if are_apart(other, best)]
     for other, its_own in others:
         errors = planes.errors_worse(its_own, misfit)
         if errors.min() < -_BETTER and errors.max() < _WORSE:
@@ -89,7 +87,7 @@ def elsewhere(
     as_good = tuple(
         RigidTransform(other.rotation, unit * other.translation)
         for other, its_own in others
-        if _apart(other, best) and planes.errors_worse(its_own, misfit).max() < _WORSE
+        if are_apart(other, best) and planes.errors_worse(its_own, misfit).max() < _WORSE
     )
     found = RigidTransform(best.rotation, unit * best.translation)
     return Elsewhere(found if better else None, as_good)
@@ -110,13 +108,3 @@ def _moved(
                 shifted = turn @ (pose.translation - pivot) + pivot
                 found.append(RigidTransform(turn @ pose.rotation, shifted))
     return found
-
-
-def _apart(one: RigidTransform, other: RigidTransform) -> bool:
-    turned = float(rotation_angle_deg(one.rotation, other.rotation))
-    moved = float(np.linalg.norm(one.translation - other.translation))
-    return turned > APART_DEG or moved > APART
-
-
-def _rows(cloud: Prepared, most: int) -> Int[np.ndarray, "p"]:
-    return np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int)

@@ -195,6 +195,8 @@ def test_targets_in_the_plane_are_not_turned_over(rng):
     found = register(trapezoid, rng.permutation(trapezoid @ turn.T + 3.0))
     assert found.success
     np.testing.assert_allclose(found.rotation[:2, :2], turn, atol=1e-9)
+    with pytest.raises(ValueError, match="a turn is about z"):
+        register(trapezoid, trapezoid, known="upright", up="y")
     mirrored = rng.uniform(0, 10, (12, 2))
     assert not register(mirrored * [1, -1], rng.permutation(mirrored @ turn.T)).success
 
