@@ -211,7 +211,8 @@ def are_apart(poses: RigidTransform, other: RigidTransform) -> Bool[np.ndarray, 
     """Whether poses, in the unit of the frame, are not `other` but for noise."""
     turned = rotation_angle_deg(poses.rotation, other.rotation)
     moved = np.linalg.norm(poses.translation - other.translation, axis=-1)
-    return (turned > APART_DEG) | (moved > APART)
+    # numpy makes a number of an array without axes.
+    return np.asarray((turned > APART_DEG) | (moved > APART))
 
 
 def _distinct(poses: RigidTransform, score: np.ndarray, most: int) -> list[int]:
