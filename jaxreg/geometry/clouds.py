@@ -75,7 +75,7 @@ def _reshaped(points: object, shape: tuple[int, ...]) -> str:
     table = ".to_numpy()" if hasattr(points, "to_numpy") else ""
     if len(shape) == 2 and shape[0] in (3, 4) and shape[1] > shape[0]:
         part = f"points{table}.T" + ("" if shape[0] == 3 else "[:, :3]")
-        return f"one point per column, not (n, 3): transpose it, as in {part}"
+        return f"one point per column, not (n, 3): give it transposed, as in {part}"
     if len(shape) == 2 and shape[1] == 2:
         return (
             "not (n, 3): add a column, as in numpy.column_stack([points, numpy.zeros(len(points))])"

@@ -17,6 +17,9 @@ from jaxreg.geometry.neighbors import without_padding
 from jaxreg.geometry.numerics import safe_sqrt
 from jaxreg.types import RigidTransform
 
+_FARTHEST = 1e150
+"""Radii, on the host: clouds that lie farther apart share nothing, and this can still be squared."""
+
 
 class Frame(NamedTuple):
     """The way back to the two original clouds: ``x = centre + length x'``. JAX or numpy arrays."""
@@ -60,6 +63,10 @@ def transform_in(frame: Frame, transform: RigidTransform | None) -> RigidTransfo
         dtype = frame.source_centre.dtype
         transform = RigidTransform(*(jnp.asarray(part, dtype) for part in transform))
     shift = transform.translation + _rotated(transform, frame) - frame.reference_centre
+    if isinstance(shift, np.ndarray):
+        with np.errstate(over="ignore"):
+            within = np.clip(shift / frame.length, -_FARTHEST, _FARTHEST)
+        return RigidTransform(transform.rotation, within)
     return RigidTransform(transform.rotation, shift / frame.length)
 
 

@@ -172,7 +172,7 @@ def with_half_turns(
     frame: a part of them has other axes. Distinct poses, the best first.
     """
     centre = points.mean(axis=0)
-    axes = np.linalg.eigh(np.cov((points - centre).T))[1].T
+    axes = np.linalg.eigh(np.cov((points - centre).T, ddof=0))[1].T
     turns = nearest_rotation(2 * axes[:, :, None] * axes[:, None, :] - np.eye(3))
     shifts = (centre - turns @ centre) @ pose.rotation.T + pose.translation
     turned = RigidTransform(

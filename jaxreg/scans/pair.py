@@ -8,13 +8,17 @@ import numpy as np
 
 from jaxreg.geometry.clouds import check_pose
 from jaxreg.geometry.rigid import rotation_angle_deg
+from jaxreg.judge.evidence import Evidence
 from jaxreg.scans import few, free_space, inside, masks, planar, prepare, similar, surfaces
 from jaxreg.scans.config import RegisterConfig, checked
 from jaxreg.scans.known import Fact, Known, known_of
 from jaxreg.scans.prepare import Prepared
-from jaxreg.scans.result import ScanRegistration, widened
+from jaxreg.scans.result import Accuracy, ScanRegistration, Verdict, assembled, centred, widened
 from jaxreg.types import RigidTransform
 
+_POINT, _SMALLEST = 1e-6, 1e-100
+"""Of a cloud that is smaller than this share of the other, the other tells nothing: between two of its
+points there is room for all of it. Below the second share numbers end before sizes do."""
 _BEYOND_DEG = 1.0
 """The refinement of a pose at the limit may turn it so much farther."""
 
@@ -165,6 +169,8 @@ def _of_one_size(
     thorough: bool = True,
 ) -> ScanRegistration:
     """Every kind of pair has a module of its own; here one is chosen."""
+    if reason := _fixes_nothing(source, reference):
+        return _unmoved(source, reference, start, reason)
     if few.is_few(source, reference) and (found := few.registered(source, reference, start, known)):
         if known.weights is not None and np.ptp(known.weights) > 0:
             raise ValueError(
@@ -183,6 +189,44 @@ def _of_one_size(
         return found
     tried = (found.transform, *(other.transform for other in found.alternatives))
     return inside.registered(source, reference, config, start, tried, known)
+
+
+def _fixes_nothing(source: Prepared, reference: Prepared) -> str:
+    """Why no pose follows from two clouds, whatever they show; empty if one may."""
+    for cloud, name in ((source, "source"), (reference, "reference")):
+        if len(cloud.points) == 1:
+            return f"All points of the {name} lie in one place, which fixes no pose."
+    small, large = sorted((source.radius, reference.radius))
+    if small >= _POINT * large:
+        return ""
+    names = ("source", "reference") if source.radius > small else ("reference", "source")
+    return (
+        f"The {names[0]} is more than {1 / _POINT:,.0f} times the size of the {names[1]}: "
+        "bring both to one unit."
+    )
+
+
+def _unmoved(
+    source: Prepared, reference: Prepared, start: RigidTransform | None, reason: str
+) -> ScanRegistration:
+    """The start, or the centroids laid on each other, as the result of a pair that fixes nothing."""
+    given = (source, reference)
+    large = max((cloud.radius for cloud in given if len(cloud.points) > 1), default=1.0)
+    first, second = (
+        dataclasses.replace(cloud, radius=min(max(cloud.radius, _SMALLEST * large), large))
+        for cloud in given
+    )
+    clouds = (first, second)
+    middle = RigidTransform(np.eye(3), np.zeros(3))
+    return assembled(
+        clouds,
+        middle if start is None else centred(clouds, start),
+        Verdict(False, 0.0, reason, Evidence(*np.zeros(len(Evidence._fields)).tolist())),
+        Accuracy(np.full((6, 6), np.nan), (), None),
+        distance=min(cloud.radius for cloud in clouds),
+        overlap=0.0,
+        alternatives=(),
+    )
 
 
 def _check_dimensions(given: tuple[object, object], clouds: tuple[Prepared, Prepared]) -> None:

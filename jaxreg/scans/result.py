@@ -135,7 +135,8 @@ def assembled(
     source, reference = clouds
     moved = (source.points * source.radius) @ pose.rotation.T + pose.translation
     near, index = trees.nearest(reference.tree, moved / reference.radius)
-    near = near * reference.radius
+    # Of a pose so far off that the squares of distances are no numbers, any point is as near.
+    near, index = near * reference.radius, np.minimum(index, len(reference.points) - 1)
     inside = near <= distance
     out = out_of(clouds, pose)
     return ScanRegistration(

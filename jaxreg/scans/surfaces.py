@@ -446,6 +446,8 @@ def _with_halves(
     found = halves.differences(source, reference, pose, distance=problem.reach(), motions=motions)
     units = np.repeat([1.0, float(problem.where.length)], 3)
     units = np.outer(units, units)
+    if not (units > 0).all() or not np.isfinite(units).all():
+        return covariance  # The unit is so odd that no variance in it is a number.
     free = 6 if motions is None else motions.shape[1]
     return halves.widened(covariance / units, found, free) * units
 

@@ -9,6 +9,13 @@ from jaxreg.geometry import arguments, frame, rigid
 from jaxreg.types import RigidTransform
 
 
+def test_clouds_beyond_any_number_apart_stay_finite():
+    where = frame.Frame(np.full(3, 1e200), np.zeros(3), 1e-200)
+    shift = frame.transform_in(where, RigidTransform(np.eye(3), np.zeros(3))).translation
+    assert np.isfinite(shift**2).all()
+    assert (shift > 1e100).all()
+
+
 def test_clouds_are_centred_and_of_unit_radius(seed):
     rng = np.random.default_rng(seed)
     x, y = 5 + 3 * rng.normal(size=(40, 3)), -7 + 2 * rng.normal(size=(30, 3))

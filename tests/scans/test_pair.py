@@ -346,6 +346,29 @@ def test_awkward_clouds_give_a_finite_rotation(name):
         assert name not in FIXES_NO_POSE or not found.success
 
 
+@pytest.mark.parametrize("ratio", [1e7, 1e29, 1e300])
+def test_a_cloud_that_is_a_point_of_the_other_is_told_and_moved_to_its_middle(rng, ratio):
+    ball = rng.normal(size=(90, 3))
+    for pair, larger in (((ball, ball / ratio), "source"), ((ball / ratio, ball), "reference")):
+        found = register(*pair, config=NARROW)
+        assert not found.success
+        assert found.reason.startswith(f"The {larger} is more than 1,000,000 times")
+        moved = pair[0] @ found.rotation.T + found.translation
+        np.testing.assert_allclose(moved.mean(axis=0), pair[1].mean(axis=0), atol=1e-12)
+        near = np.linalg.norm(found.correspondences[:, None] - pair[1], axis=2).min(axis=1)
+        assert near.max() < 1e-15
+
+
+def test_a_cloud_of_one_place_is_told(rng):
+    for pair in (
+        (np.ones((9, 3)), rng.normal(size=(90, 3))),
+        (np.ones((9, 3)), np.eye(3) * 1e-300),
+    ):
+        assert "source lie in one place" in register(*pair, config=NARROW).reason
+        start = np.eye(4) + 2 * np.eye(4, k=3)
+        assert register(*pair, initial=start, config=NARROW).translation[0] == pytest.approx(2)
+
+
 @pytest.mark.slow
 def test_a_regular_grid_is_laid_on_the_grid(rng):
     """T25: every point looks like every other; any symmetry of the cube is as good."""
