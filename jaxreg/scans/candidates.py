@@ -14,6 +14,7 @@ from jaxreg.judge.surface import Examined
 from jaxreg.refine.config import RefineConfig
 from jaxreg.refine.kdtree import IndexedCloud, iterate_all
 from jaxreg.refine.robust import Weighting
+from jaxreg.scans import repeats
 from jaxreg.scans.free_space import Sides
 from jaxreg.types import RigidTransform
 
@@ -172,8 +173,7 @@ def with_half_turns(
     frame: a part of them has other axes. Distinct poses, the best first.
     """
     centre = points.mean(axis=0)
-    axes = np.linalg.eigh(np.cov((points - centre).T, ddof=0))[1].T
-    turns = nearest_rotation(2 * axes[:, :, None] * axes[:, None, :] - np.eye(3))
+    turns = repeats.half_turns(repeats.principal_axes(points))
     shifts = (centre - turns @ centre) @ pose.rotation.T + pose.translation
     turned = RigidTransform(
         np.concatenate([pose.rotation[None], pose.rotation @ turns]),

@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxreg.geometry import frame
+from jaxreg.geometry import frame, se3
 from jaxreg.geometry.rigid import rotation_angle_deg
 from jaxreg.judge.odds import chances
-from jaxreg.scans import candidates, masks, prepare, surfaces
+from jaxreg.scans import candidates, masks, prepare, repeats, surfaces
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
 from jaxreg.scans.prepare import Prepared
-from jaxreg.scans.result import ScanRegistration, centred, widened
+from jaxreg.scans.result import ScanRegistration, centred, out_of, widened
 from jaxreg.types import RigidTransform
 
 _RATIO = 1.5
@@ -32,6 +32,8 @@ _MOST = 80
 """Most tiles."""
 _A_TILE, _ALL_TILES = 2, 8
 """Poses that are judged of one tile, and of all."""
+_RASTERED = 20_000
+"""Points of each cloud that are looked at for places where the small one fits as well."""
 _FEWEST = 200
 """Points of a tile that is worth a search."""
 
@@ -95,11 +97,14 @@ def registered(
     """
     large = 1 if known.inside or reference.radius >= source.radius else 0
     pair = Nested(source, reference, large)
+    if start is None and not tried:
+        tried = _found_in_whole(pair, config, known)
     judged = _judged(pair, tried if start is None else (start, *tried), config, known)
     if known.inside and start is None and _likeliest(judged) < surfaces.SURE:
         judged += _judged(pair, _found_in_tiles(pair, config, known), config, known)
     if not judged:
         return surfaces.registered(source, reference, config, start, known)
+    judged += _judged(pair, _repeats(pair, _distinct(judged)[0].pose, known), config, known)
     best, *others = _distinct(judged)
     poses = [frame.transform_in(best.problem.where, one.pose) for one in (best, *others)]
     scores = [one.score for one in others]
@@ -127,22 +132,45 @@ def _judged(
     """The poses, each refined and judged with the part of the large cloud that the small one covers."""
     judged = []
     for pose in poses:
-        if (piece := covered(pair, pose, config)) is None:
-            continue
-        problem = piece.problem(pair, config, known)
-        here = frame.transform_in(problem.where, pose)
-        found = candidates.judged(
-            problem.clouds(),
-            RigidTransform(here.rotation[None], here.translation[None]),
-            np.zeros(1),
-            distance=problem.reach(),
-            most=1,
-            motions=problem.motions,
-        )
-        refined = RigidTransform(found.poses.rotation[0], found.poses.translation[0])
-        out = frame.transform_out(problem.where, refined)
-        judged.append(_Judged(out, float(found.score[0]), problem))
+        # What is covered under the refined pose may be more than it was before.
+        first = _judged_once(pair, pose, config, known)
+        again = first and _judged_once(pair, first.pose, config, known)
+        judged += [one for one in (again or first,) if one]
     return judged
+
+
+def _judged_once(
+    pair: Nested, pose: RigidTransform, config: RegisterConfig, known: Known
+) -> _Judged | None:
+    if (piece := covered(pair, pose, config)) is None:
+        return None
+    problem = piece.problem(pair, config, known)
+    here = frame.transform_in(problem.where, pose)
+    found = candidates.judged(
+        problem.clouds(),
+        RigidTransform(here.rotation[None], here.translation[None]),
+        np.zeros(1),
+        distance=problem.reach(),
+        most=1,
+        motions=problem.motions,
+    )
+    refined = RigidTransform(found.poses.rotation[0], found.poses.translation[0])
+    out = frame.transform_out(problem.where, refined)
+    return _Judged(out, float(found.score[0]), problem)
+
+
+def _repeats(pair: Nested, pose: RigidTransform, known: Known) -> tuple[RigidTransform, ...]:
+    """The other poses, of the clouds as given, that lay about as much of the small one on the large."""
+    here = centred(pair.clouds, pose)
+    if pair.large == 0:
+        here = se3.inverted(here)
+    part, whole = (
+        cloud.points[cloud.rows(_RASTERED)] * cloud.radius for cloud in (pair.part, pair.whole)
+    )
+    found, _ = repeats.others(part, whole, here, most=_ALL_TILES, up=known.up)
+    if pair.large == 0:
+        found = se3.inverted(found)
+    return tuple(out_of(pair.clouds, RigidTransform(*one)) for one in zip(*found, strict=True))
 
 
 def _distinct(judged: list[_Judged]) -> list[_Judged]:
@@ -160,6 +188,16 @@ def _distinct(judged: list[_Judged]) -> list[_Judged]:
         else:
             chosen.append(one)
     return chosen
+
+
+def _found_in_whole(
+    pair: Nested, config: RegisterConfig, known: Known
+) -> tuple[RigidTransform, ...]:
+    """The likeliest poses of the two clouds as they are, as poses of the clouds as given."""
+    problem = surfaces.pose_problem(*pair.clouds, config, known)
+    found = surfaces.searched(problem)
+    poses = (found.pose, *(pose for pose, _ in found.others))
+    return tuple(frame.transform_out(problem.where, pose) for pose in poses[:_A_TILE])
 
 
 def _found_in_tiles(

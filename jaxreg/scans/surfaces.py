@@ -24,6 +24,7 @@ from jaxreg.scans import (
     free_space,
     halves,
     prepare,
+    repeats,
     stable,
     verdict,
     weak,
@@ -54,6 +55,10 @@ _UNLIKE_SIZES = 2.0
 """Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
+_CLOSE = 0.1
+"""Poses of this probability are compared with the likeliest one on many points."""
+_REPEATS = 16
+"""Poses that are judged of those a period on, or turned by half."""
 _SOME_SAME = 0.05
 """Share of points that coincide above which the clouds may be copies: two scans share hardly any."""
 _ROUNDING_DEG = 0.05
@@ -162,6 +167,8 @@ def searched(problem: Problem) -> Found:
         found = candidates.merged(found, searched_and_judged(problem, config.wide))
         if (nearer := closer(problem)) and chances(found.score).max() < SURE:
             found = candidates.merged(found, searched_and_judged(nearer, config.wide))
+    if chances(found.score).max() >= verdict.TRUSTED:
+        found = _with_repeats(problem, found)
     turned = rotation_angle_deg(found.poses.rotation, np.eye(3)[None])
     # A pose that turns too far is not a rival: it was ruled out. If no pose is allowed, the best of
     # the others is at least an answer.
@@ -177,6 +184,20 @@ def searched(problem: Problem) -> Found:
         tuple((poses[i], float(found.score[i])) for i in others),
         float(chances(found.score)[best]),
     )
+
+
+def _with_repeats(problem: Problem, found: candidates.Judged) -> candidates.Judged:
+    """Also the poses that lay about as much of the source on the reference as the best one does."""
+    clouds = problem.clouds()
+    source, reference = (cloud.points * cloud.scale for cloud in clouds[:2])
+    best = RigidTransform(found.poses.rotation[0], found.poses.translation[0])
+    poses, share = repeats.others(source, reference, best, most=_REPEATS, up=problem.known.up)
+    if not len(share):
+        return found
+    again = candidates.judged(
+        clouds, poses, share, distance=problem.reach(), most=_REPEATS, motions=problem.motions
+    )
+    return candidates.merged(found, again)
 
 
 def closer(problem: Problem) -> Problem | None:
@@ -382,6 +403,10 @@ def finished(
     if rivals:
         others = candidates.distinct_from(refined.transform, (*others, *rivals))
     likelihood = chances(np.array([score[0], *(s for _, s in others)]))
+    if closely and (as_likely := _as_likely(problem, refined.transform, others, likelihood)):
+        raised = ((other, float(score[0])) for other in as_likely)
+        others = candidates.distinct_from(refined.transform, (*others, *raised))
+        likelihood = chances(np.array([score[0], *(s for _, s in others)]))
     free = tuple(
         direction._replace(point=where.reference_centre + length * direction.point)
         for direction in hardly_held
@@ -433,6 +458,31 @@ def _along_weak(
     if found.better is not None:
         settled = stable.settled(source, reference, found.better, reach, known=problem.known)
     return settled, tuple(in_unit(other, 1 / length) for other in found.as_good)
+
+
+def _as_likely(
+    problem: Problem,
+    pose: RigidTransform,
+    others: tuple[tuple[RigidTransform, float], ...],
+    likelihood: Float[np.ndarray, "k"],
+) -> tuple[RigidTransform, ...]:
+    """The likelier ones of the other poses, where many points speak for them as much as for the pose.
+
+    Of two places one period apart the judge prefers one for what lies where the scans end.
+    """
+    if likelihood[0] < verdict.TRUSTED or problem.config.refine is None:
+        return ()
+    close = (likelihood[1:] >= _CLOSE) & (likelihood[1:] < verdict.RIVAL)
+    length, reach = float(problem.where.length), problem.reach()
+    rivals = tuple(in_unit(others[i][0], length) for i in np.flatnonzero(close))
+    if not rivals:
+        return ()
+    clouds = problem.source, problem.reference
+    found = weak.elsewhere(
+        *clouds, in_unit(pose, length), (), reach * length, problem.known, rivals
+    )
+    better = () if found.better is None else (found.better,)
+    return tuple(in_unit(other, 1 / length) for other in (*better, *found.as_good))
 
 
 def _with_halves(

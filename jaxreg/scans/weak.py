@@ -51,11 +51,12 @@ def elsewhere(
     weak: tuple[WeakDirection, ...],
     reach: float,
     known: Known,
+    rivals: tuple[RigidTransform, ...] = (),
 ) -> Elsewhere:
     """What lies along the `weak` directions of a pose, on the points of the prepared clouds.
 
-    Poses and directions are of the centred clouds in the unit of the input, in which points may lie
-    `reach` off; what is `known` limits the motions and how far they go.
+    The same is told of its `rivals`. Poses and directions are of the centred clouds in the unit of the
+    input, in which points may lie `reach` off; what is `known` limits the motions and how far they go.
     """
     unit, motions = reference.radius, known.motions
     largest = min(_MOVED, _WITHIN_LIMIT * math.radians(known.max_rotation_deg))
@@ -78,7 +79,8 @@ def elsewhere(
     its_own = against(again)
     if planes.errors_worse(its_own, misfit).min() < -_BETTER:
         best, misfit, better = again, its_own, True
-    others = [fitted(moved) for moved in _moved(best, weak, unit, largest)]
+    others = [RigidTransform(one.rotation, one.translation / unit) for one in rivals]
+    others = [fitted(moved) for moved in (*others, *_moved(best, weak, unit, largest))]
     others = [(other, against(other)) for other in others if are_apart(other, best)]
     for other, its_own in others:
         errors = planes.errors_worse(its_own, misfit)
