@@ -55,7 +55,7 @@ _UNLIKE_SIZES = 2.0
 """Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
-_CLOSE = 0.1
+_CLOSE = verdict.RIVAL / 2
 """Poses of this probability are compared with the likeliest one on many points."""
 _REPEATS = 16
 """Poses that are judged of those a period on, or turned by half."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxreg.data.procedural.surfaces import box, sample, union
 from jaxreg.scans import inside, prepare
 from jaxreg.scans.config import RegisterConfig
 from jaxreg.scans.known import Known
@@ -125,3 +126,33 @@ def test_a_submap_in_a_map(start):
     assert np.linalg.norm(off) < 0.15
     assert found.success
     assert found.confidence.shape == (len(part),)
+
+
+@pytest.mark.parametrize("large", [0, 1])
+def test_a_box_in_a_scene_is_turned_by_half_as_well(large):
+    rng = np.random.default_rng(6)
+    brick = box((1.0, 0.6, 0.4))
+    table = box((6, 5, 0.1), (1, 1, -0.26))
+    part, whole = (
+        prepared(sample(rng, brick, 4000)),
+        prepared(sample(rng, union(brick, table), 20_000)),
+    )
+    turn = Rotation.random(random_state=2).as_matrix()
+    whole = prepared(moved(whole.points * whole.radius + whole.centre, turn, np.ones(3)))
+    pose = RigidTransform(turn, np.ones(3))
+    pair = inside.Nested(whole, part, 0) if large == 0 else inside.Nested(part, whole, 1)
+    if large == 0:
+        pose = RigidTransform(turn.T, -turn.T @ np.ones(3))
+    found = inside._repeats(pair, pose, Known())
+    for axis in np.eye(3):
+        half = Rotation.from_rotvec(np.pi * axis).as_matrix()
+        expected = turn @ half if large == 1 else half @ turn.T
+        middle = part.centre if large == 1 else turn @ part.centre + np.ones(3)
+        off = [
+            np.linalg.norm(expected @ x.rotation.T - np.eye(3))
+            + np.linalg.norm(
+                (x.rotation - pose.rotation) @ middle + x.translation - pose.translation
+            )
+            for x in found
+        ]
+        assert min(off) < 0.3
