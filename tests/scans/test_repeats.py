@@ -51,6 +51,7 @@ def test_the_share_is_that_of_points_near_the_reference(rng):
     poses, share = repeats.others(part, reference, RigidTransform(np.eye(3), np.zeros(3)), most=4)
     near = cKDTree(reference).query(part + PLACES[2])[0] < 0.02
     at = np.abs(poses.translation - PLACES[2]).max(axis=1).argmin()
+    assert np.abs(poses.translation[at] - PLACES[2]).max() < CELL
     assert share[at] == pytest.approx(near.mean(), abs=0.05)
 
 
