@@ -173,7 +173,7 @@ def with_half_turns(
     frame: a part of them has other axes. Distinct poses, the best first.
     """
     centre = points.mean(axis=0)
-    turns = repeats.half_turns(repeats.principal_axes(points))
+    turns = repeats.half_turns(repeats.axes_of(points, None))
     shifts = (centre - turns @ centre) @ pose.rotation.T + pose.translation
     turned = RigidTransform(
         np.concatenate([pose.rotation[None], pose.rotation @ turns]),

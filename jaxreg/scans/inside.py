@@ -167,7 +167,8 @@ def _repeats(pair: Nested, pose: RigidTransform, known: Known) -> tuple[RigidTra
     part, whole = (
         cloud.points[cloud.rows(_RASTERED)] * cloud.radius for cloud in (pair.part, pair.whole)
     )
-    found, _ = repeats.others(part, whole, here, most=_ALL_TILES, up=known.up)
+    axes = repeats.axes_of(part, known.up)
+    found, _ = repeats.others(part, whole, here, axes=axes, most=_ALL_TILES)
     if pair.large == 0:
         found = se3.inverted(found)
     return tuple(out_of(pair.clouds, RigidTransform(*one)) for one in zip(*found, strict=True))

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 from jaxreg.geometry.rigid import nearest_rotation
 from jaxreg.types import RigidTransform
 
-_CELLS = 150_000
-"""Cells of a raster."""
+COARSE, FINE = 20_000, 150_000
+"""Cells of a raster: enough for half turns, and for periods."""
 _THINNEST = 0.02
 """Least extent of a raster, as a share of its largest: a plane has few layers of cells."""
 _BLUR = 0.7
@@ -50,21 +50,21 @@ def others(
     reference: Float[np.ndarray, "m 3"],
     pose: RigidTransform,
     *,
+    axes: Float[np.ndarray, "a 3"],
     most: int,
-    up: Float[np.ndarray, "3"] | None = None,
+    resolution: int = FINE,
 ) -> tuple[RigidTransform, Float[np.ndarray, "k"]]:
     """At most `most` other poses that lay about as much of the source on the reference, best first.
 
     With each the share of the source that it does lay there, of what the pose does. Points and poses
-    are in one frame and unit, and the points should be about as dense in both clouds. An axis that
-    stays upright (`up`) is the only one that the source is turned about.
+    are in one frame and unit, and the points should be about as dense in both clouds. The source is
+    shifted only, or turned by half about one of the `axes` (unit vectors, in its own frame) as well.
     """
-    axes = principal_axes(source) if up is None else up[None]
     rotations = np.concatenate([pose.rotation[None], pose.rotation @ half_turns(axes)])
     turned = source @ np.swapaxes(rotations, 1, 2)
     corners, low = turned.min(axis=1), reference.min(axis=0)
     extent = np.ptp(reference, axis=0)
-    raster = _raster(extent + np.ptp(turned, axis=1).max(axis=0))
+    raster = _raster(extent + np.ptp(turned, axis=1).max(axis=0), resolution)
     shares = _shares(turned - corners[:, None], reference - low, raster)
     start = np.round((pose.translation - low + corners[0]) / raster.cell).astype(np.int64)
     own = max(float(shares[0][tuple(((start + _AROUND) % raster.shape).T)].max()), 1e-6)
@@ -81,8 +81,12 @@ def others(
     return RigidTransform(rotations[which[chosen]], shifts[chosen]), share[chosen]
 
 
-def principal_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
-    """Unit vectors, one a row."""
+def axes_of(
+    points: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "a 3"]:
+    """The principal axes of a cloud, one a row; the one that stays upright, if it is known."""
+    if up is not None:
+        return up[None]
     return np.linalg.eigh(np.cov((points - points.mean(axis=0)).T, ddof=0))[1].T
 
 
@@ -91,11 +95,11 @@ def half_turns(axes: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3 3"]:
     return nearest_rotation(2 * axes[:, :, None] * axes[:, None, :] - np.eye(3))
 
 
-def _raster(extent: Float[np.ndarray, "3"]) -> _Raster:
+def _raster(extent: Float[np.ndarray, "3"], cells: int) -> _Raster:
     from scipy import fft
 
     extent = np.maximum(extent, _THINNEST * extent.max())
-    cell = float(np.prod(extent) / _CELLS) ** (1 / 3) or 1.0
+    cell = float(np.prod(extent) / cells) ** (1 / 3) or 1.0
     counts = (extent / cell).astype(int) + 2
     x, y, z = (int(fft.next_fast_len(count, real=True) or count) for count in counts.tolist())
     return _Raster(cell, (x, y, z))

@@ -55,7 +55,7 @@ _UNLIKE_SIZES = 2.0
 """Ratio of the radii from which a scan may lie inside the other, and is looked for at its own scale."""
 _FIRST, _WIDE = 4, 16
 """Distinct poses that are refined and judged, after the first search and after the wider one."""
-_CLOSE = verdict.RIVAL / 2
+_CLOSE = 0.1
 """Poses of this probability are compared with the likeliest one on many points."""
 _REPEATS = 16
 """Poses that are judged of those a period on, or turned by half."""
@@ -191,9 +191,15 @@ def _with_repeats(problem: Problem, found: candidates.Judged) -> candidates.Judg
     clouds = problem.clouds()
     source, reference = (cloud.points * cloud.scale for cloud in clouds[:2])
     best = RigidTransform(found.poses.rotation[0], found.poses.translation[0])
-    poses, share = repeats.others(source, reference, best, most=_REPEATS, up=problem.known.up)
-    if not len(share):
+    none, axes = np.zeros((0, 3)), repeats.axes_of(source, problem.known.up)
+    # Few cells tell that no half turn is as good, and one transform that no shift is.
+    at_all = [
+        repeats.others(source[::4], reference, best, axes=axes, most=1, resolution=repeats.COARSE),
+        repeats.others(source, reference, best, axes=none, most=1),
+    ]
+    if not any(len(share) for _, share in at_all):
         return found
+    poses, share = repeats.others(source, reference, best, axes=axes, most=_REPEATS)
     again = candidates.judged(
         clouds, poses, share, distance=problem.reach(), most=_REPEATS, motions=problem.motions
     )

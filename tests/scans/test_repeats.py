@@ -11,6 +11,8 @@ from jaxreg.scans.pair import register
 from jaxreg.types import RigidTransform
 
 PLACES = np.array([[0.0, 0, 0], [1.3, 0, 0], [0, -0.9, 0.4], [-2.1, 0.7, -0.6]])
+NONE = np.zeros((0, 3))
+POSE = RigidTransform(np.eye(3), np.zeros(3))
 CELL = 0.15
 """More than the edge of a cell of these rasters."""
 
@@ -34,7 +36,9 @@ def test_all_copies_are_found_and_nothing_else(rng):
     part = part[part.sum(axis=1) < 0.8]
     turn = Rotation.random(random_state=5).as_matrix()
     reference = np.concatenate([part @ turn.T + place for place in PLACES])
-    poses, share = repeats.others(part, reference, RigidTransform(turn, PLACES[0]), most=16)
+    poses, share = repeats.others(
+        part, reference, RigidTransform(turn, PLACES[0]), axes=NONE, most=16
+    )
     for place in PLACES[1:]:
         assert np.abs(poses.translation - place).max(axis=1).min() < CELL
     for rotation, shift in placed(poses):
@@ -48,7 +52,7 @@ def test_the_share_is_that_of_points_near_the_reference(rng):
     """The copy begins where the reference has ended."""
     part = rng.uniform(-0.5, 0.5, size=(3000, 3)) * [1, 0.7, 0.02]
     reference = np.concatenate([part, part[part[:, 1] > -0.25] + PLACES[2]])
-    poses, share = repeats.others(part, reference, RigidTransform(np.eye(3), np.zeros(3)), most=4)
+    poses, share = repeats.others(part, reference, POSE, axes=NONE, most=4)
     near = cKDTree(reference).query(part + PLACES[2])[0] < 0.02
     at = np.abs(poses.translation - PLACES[2]).max(axis=1).argmin()
     assert np.abs(poses.translation[at] - PLACES[2]).max() < CELL
@@ -60,19 +64,20 @@ def test_half_turns_lie_about_the_axes_or_the_upright_one(rng):
     turns = Rotation.from_rotvec([[np.pi, 0, 0], [0, 0, np.pi]]).as_matrix()
     whole = np.concatenate([half, *(half @ turn.T for turn in turns), half * [-1, 1, -1]])
     whole -= whole.mean(axis=0)
-    pose = RigidTransform(np.eye(3), np.zeros(3))
-    poses, _ = repeats.others(whole, whole, pose, most=16)
+    poses, _ = repeats.others(whole, whole, POSE, axes=repeats.axes_of(whole, None), most=16)
     about_center = [rotation for rotation, shift in placed(poses) if np.abs(shift).max() < CELL * 4]
     for turn in (*turns, np.diag([-1.0, 1, -1])):
         assert min(angle_deg(turn, found) for found in about_center) < 2
     up = np.array([0.0, 0, 1])
-    for rotation, _ in placed(repeats.others(whole, whole, pose, most=16, up=up)[0]):
+    for rotation, _ in placed(
+        repeats.others(whole, whole, POSE, axes=repeats.axes_of(whole, up), most=16)[0]
+    ):
         np.testing.assert_allclose(rotation @ up, up, atol=1e-9)
 
 
 @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((5, 3)), np.eye(3)[:2]])
 def test_clouds_without_an_extent_have_no_places(points):
-    poses, share = repeats.others(points, points, RigidTransform(np.eye(3), np.zeros(3)), most=4)
+    poses, share = repeats.others(points, points, POSE, axes=repeats.axes_of(points, None), most=4)
     assert len(share) == len(poses.rotation)
     assert np.isfinite(poses.translation).all()
 
