@@ -200,6 +200,8 @@ def _with_repeats(problem: Problem, found: candidates.Judged) -> candidates.Judg
     if not any(len(share) for _, share in at_all):
         return found
     poses, share = repeats.others(source, reference, best, axes=axes, most=_REPEATS)
+    if not len(share):
+        return found
     again = candidates.judged(
         clouds, poses, share, distance=problem.reach(), most=_REPEATS, motions=problem.motions
     )
