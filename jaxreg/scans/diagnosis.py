@@ -43,10 +43,11 @@ def findings(points: Float[np.ndarray, "n 3"]) -> list[str]:
     large offset; many repeated points, or copies with other digits; two-dimensional, planar, thin
     clouds; a density that varies a hundredfold.
     """
-    far = strays.strays(points)
-    told = [strays.told(points, far)] if far.any() else []
-    points = points[~far]
-    distinct = np.unique(points, axis=0)
+    distinct, row = np.unique(points, axis=0, return_inverse=True)
+    row = row.ravel()
+    far = strays.strays(distinct)
+    told = [strays.told(points, far[row])] if far.any() else []
+    points, distinct = points[~far[row]], distinct[~far]
     if len(distinct) < 3:
         return [f"only {len(distinct)} distinct points: a pose needs 3"]
     repeated = 1 - len(distinct) / len(points)

@@ -190,13 +190,15 @@ def prepare(
     heights = array[kept, 2]
     height = float(heights[0]) if np.ptp(heights) == 0 else None
     place = free_space.check_place(viewpoint, name, height=height)
-    far, notes = _strays(array[kept], strays, name)
-    if strays == "drop":
-        kept[kept] = ~far
-        far = far[~far]
     points, first, row = _distinct(array[kept])
     across = None if across is None else across[kept][first]
-    centre, radius = frame.measure(points[~far[first]])
+    far, notes = _strays(points, row, strays, name)
+    if strays == "drop" and far.any():
+        points, across = points[~far], None if across is None else across[~far]
+        kept[kept] = ~far[row]
+        row = (np.cumsum(~far) - 1)[row[~far[row]]]
+        far = far[~far]
+    centre, radius = frame.measure(points[~far])
     points = (points - centre) / (radius or 1.0)
     place = None if place is None else (place - centre) / (radius or 1.0)
     k = 10 if config.refine is None else config.refine.k
@@ -358,15 +360,15 @@ def _describe(points, mask, unit, normals, neighbors, *, radii: tuple[float, ...
 
 
 def _strays(
-    points: np.ndarray, wanted: Literal["drop", "keep", "raise"], name: str
+    points: np.ndarray, row: np.ndarray, wanted: Literal["drop", "keep", "raise"], name: str
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Which points are strays, and a sentence on them."""
+    """Which of the distinct points are strays, and a sentence on the rows that have them."""
     if wanted not in ("drop", "keep", "raise"):
         raise ValueError(f"strays must be 'drop', 'keep' or 'raise', got {wanted!r}.")
     far = stray_points.strays(points)
     if not far.any():
         return far, ()
-    told = f"{name}: {stray_points.told(points, far)}"
+    told = f"{name}: {stray_points.told(points[row], far[row])}"
     if wanted == "raise":
         raise ValueError(f"{told}: remove them, or pass strays='drop' or strays='keep'.")
     return far, (told + ("; left out" if wanted == "drop" else ""),)

@@ -16,7 +16,10 @@ _FEWEST = 20
 
 
 def strays(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Which of the points are strays. All points are finite."""
+    """Which of the distinct points of a cloud are strays. All points are finite.
+
+    A place counts once, however many rows have it: what did not come back is often written as zeros.
+    """
     if len(points) < _FEWEST:
         return np.zeros(len(points), bool)
     distance = _from_middle(points)

@@ -358,10 +358,7 @@ STRAYS = {
     ),
     "a tenth is zeros": lambda: with_rows(np.zeros((500, 3)), told="500 points lie"),
 }
-STRAYS_WRONG = {
-    "a tenth of both is zeros": "right to 0.3 degrees and refused (all motions free); none is told",
-    "a tenth is zeros": "right, but the rows are neither counted nor named: dropped is 0",
-}
+STRAYS_WRONG = {}
 
 
 # A3: success only where the dense points agree.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxreg.scans import prepare
+from jaxreg.scans import diagnosis, prepare
 from jaxreg.scans.config import RegisterConfig
 
 
@@ -93,6 +93,25 @@ def test_spacing_of_a_grid_is_its_edge():
     grid = np.stack(np.meshgrid(np.arange(30), np.arange(30), [0.0]), axis=-1).reshape(-1, 3)
     assert prepare.spacing(0.25 * grid) == pytest.approx(0.25)
     assert prepare.spacing(1e-12 * grid) == pytest.approx(1e-12)  # in whatever unit
+
+
+def test_many_rows_of_one_place_far_away_are_one_stray(rng):
+    """What did not come back, written as zeros; with normals, and repeated rows."""
+    cloud = np.repeat(rng.normal(size=(250, 3)) + [5e5, 4e6, 100], 2, axis=0)
+    rows = np.sort(rng.choice(len(cloud), 100, replace=False))
+    given = np.insert(cloud, rows, 0, axis=0)
+    zero = (given == 0).all(axis=1)
+    normals = np.where(zero[:, None], 0, [[0.0, 0, 1]])
+    found = prepare.prepare(given, normals=normals)
+    np.testing.assert_array_equal(found.kept, ~zero)
+    assert found.notes[0].startswith("cloud: 100 points lie 4.03e+06 from the rest")
+    again = found.points[found.row] * found.radius + found.centre
+    np.testing.assert_allclose(again, cloud, atol=1e-8)
+    np.testing.assert_array_equal(found.normals, np.tile([0.0, 0, 1], (250, 1)))
+    assert "100 points lie" in diagnosis.findings(given)[0]
+    kept = prepare.prepare(given, strays="keep")
+    assert kept.kept.all()
+    assert kept.radius == pytest.approx(found.radius, rel=0.1)
 
 
 def test_a_stray_row_does_not_overflow_the_numbers_of_the_cubes(rng):
