@@ -31,6 +31,8 @@ takes up to a second. Of right poses of real scans (docs/notes/0045) those that 
 as many off, where the scans end or depth is bent; those that overlap so far have not."""
 _SPREAD = 1.15
 """Of normal errors half are below 0.67; right poses of real scans have 0.6 to 1.1, one of 19 1.2."""
+_ROUGH = 0.8
+"""Where all of the source lies over the other surface it is 0.63 to 0.76, and more if parts moved."""
 _BETTER = 0.4
 """Another cause fits better if it leaves this share of the points that are off."""
 _NEARER = 0.6
@@ -88,6 +90,11 @@ class Agreement(NamedTuple):
     def drawn(self) -> bool:
         """Whether nothing fits to the noise, as where a part that moved drew the pose along."""
         return self.comparable and self.spread >= _SPREAD
+
+    @property
+    def rough(self) -> bool:
+        """Whether a part may have moved by hardly more than the surface is rough."""
+        return self.compared >= 0.9 and self.spread >= _ROUGH
 
     @property
     def different(self) -> bool:

@@ -97,9 +97,10 @@ def registered(
     """
     large = 1 if known.inside or reference.radius >= source.radius else 0
     pair = Nested(source, reference, large)
-    if start is None and not tried:
-        tried = _found_in_whole(pair, config, known)
     judged = _judged(pair, tried if start is None else (start, *tried), config, known)
+    # The poses that were tried come from a search of these two in this order.
+    if start is None and (pair.large == 0 or not tried):
+        judged += _judged(pair, _found_in_whole(pair, config, known), config, known)
     if known.inside and start is None and _likeliest(judged) < surfaces.SURE:
         judged += _judged(pair, _found_in_tiles(pair, config, known), config, known)
     if not judged:
@@ -194,11 +195,13 @@ def _distinct(judged: list[_Judged]) -> list[_Judged]:
 def _found_in_whole(
     pair: Nested, config: RegisterConfig, known: Known
 ) -> tuple[RigidTransform, ...]:
-    """The likeliest poses of the two clouds as they are, as poses of the clouds as given."""
-    problem = surfaces.pose_problem(*pair.clouds, config, known)
+    """The likeliest poses of the small one in the whole large one, as poses of the clouds as given."""
+    known = known._replace(weights=None)
+    problem = surfaces.pose_problem(pair.part, pair.whole, config, known)
     found = surfaces.searched(problem)
     poses = (found.pose, *(pose for pose, _ in found.others))
-    return tuple(frame.transform_out(problem.where, pose) for pose in poses[:_A_TILE])
+    poses = (frame.transform_out(problem.where, pose) for pose in poses[:_A_TILE])
+    return tuple(pose if pair.large == 1 else se3.inverted(pose) for pose in poses)
 
 
 def _found_in_tiles(

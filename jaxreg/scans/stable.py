@@ -30,8 +30,8 @@ _AROUND = 16
 _STAYED, _MOVED = 1.25, 2.0
 """Where their median distance is so many times that of the noise, it did not, or it did."""
 _GAIN = 1.02
-"""A pose is taken if so many times as many points agree with it: lie within one noise level. Within
-three a pose that was drawn along a little agrees about as well as the right one."""
+"""A pose is taken if so many times as many points agree with it: lie within half a noise level. Within
+one or three a pose that was drawn along a little agrees about as well as the right one."""
 _MORE = 1.2
 """And the pose of a half, if so many times as many points are within the noise as under that of all."""
 _MAJORITY = 0.6
@@ -108,7 +108,7 @@ def settled(
     )
     before = planes.fitted(second, finer, start, np.zeros(0), motions=motions)
     agree, agreed = (
-        np.sum(given[many] * (one.over & (np.abs(one.off) < level))) for one in (found, before)
+        np.sum(given[many] * (one.over & (np.abs(one.off) < level / 2))) for one in (found, before)
     )
     # What moved and yet lies within the kernel is no noise: it draws more on a wider one.
     drawn = _difference(wider.pose, found.pose)

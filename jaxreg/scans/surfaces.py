@@ -318,7 +318,7 @@ def _with_all_points(problem: Problem, refined: Refined, *, causes: bool) -> _Cl
     pose = in_unit(refined.transform, float(problem.where.length))
     now = dense.at_a_glance(source, reference, pose)
     weights, reach = problem.known.weights, problem.reach() * float(problem.where.length)
-    if weights is None and not (now.suspicious or now.drawn):
+    if weights is None and not (now.suspicious or now.drawn or now.rough):
         return _Closing(cause=_slight_size(problem, pose, now))
     settled = None
     if problem.config.refine is not None:
@@ -420,12 +420,13 @@ def finished(
         for direction in hardly_held
     )
     chance = 0.0 if cause or verdict.is_free(judged, free) else float(likelihood[0])
-    success = verdict.is_success(chance, likelihood[1:], refined.converged)
-    reason = ""
+    likely = verdict.is_success(chance, likelihood[1:], refined.converged)
+    loose = verdict.held_loosely(covariance) if likely else ""
+    success, reason = likely and not loose, ""
     if not success:
         rivals = float(likelihood[1:].sum())
         cause = cause or _contradiction(problem, refined.transform)
-        reason = cause or _reason(problem, refined, judged, free, rivals)
+        reason = cause or loose or _reason(problem, refined, judged, free, rivals)
     return assembled(
         (source, problem.reference),
         in_unit(refined.transform, length),

@@ -14,6 +14,10 @@ TRUSTED = 0.5
 """Probability from which a registration counts as a success."""
 RIVAL = 0.25
 """A pose is no success if another one is right with this probability: several agree then."""
+_LOOSE_DEG = 3.0
+"""Standard deviation of the rotation from which a pose is no success. It says how far halves of the
+overlap differ, and under a wrong pose these pull apart: of 159 virtual pairs that were believed it is
+above 3 degrees for 7 of 8 wrong poses and for 1 of 151 right ones (docs/notes/0066)."""
 _VOLUME = 0.185
 """Median surface variation of points that fill a volume: 0.19 to 0.22 in a cube; surfaces have less,
 and of thin parts up to 0.19 (docs/notes/0037)."""
@@ -56,6 +60,17 @@ def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | 
     """Whether a pose is to be trusted, from its probability and those of the others."""
     alone = len(rivals) == 0 or float(np.max(rivals)) < RIVAL
     return chance >= TRUSTED and alone and converged is not False
+
+
+def held_loosely(covariance: Float[np.ndarray, "6 6"]) -> str:
+    """A sentence if the rotation is known to a few degrees only, by the covariance of a pose."""
+    deviation = float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
+    if not deviation > _LOOSE_DEG:  # NaN where nothing was refined
+        return ""
+    return (
+        f"What overlaps holds the rotation to {deviation:.1f} degrees (a standard deviation), too "
+        "loosely to tell the right pose from a wrong one."
+    )
 
 
 def in_a_volume(found: Evidence, *clouds: Examined) -> str:
