@@ -62,9 +62,14 @@ def is_success(chance: float, rivals: Float[np.ndarray, "k"], converged: bool | 
     return chance >= TRUSTED and alone and converged is not False
 
 
+def rotation_deviation_deg(covariance: Float[np.ndarray, "6 6"]) -> float:
+    """The standard deviation of the rotation, about all axes together; NaN if it is not known."""
+    return float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
+
+
 def held_loosely(covariance: Float[np.ndarray, "6 6"]) -> str:
     """A sentence if the rotation is known to a few degrees only, by the covariance of a pose."""
-    deviation = float(np.degrees(np.sqrt(np.trace(covariance[:3, :3]))))
+    deviation = rotation_deviation_deg(covariance)
     if not deviation > _LOOSE_DEG:  # NaN where nothing was refined
         return ""
     return (

@@ -170,3 +170,23 @@ def test_a_box_names_points():
     for box in ([0, 0, 1], [1, 0, 0, 1], [0, 0, 0, 0]):
         with pytest.raises(ValueError, match="x0,y0,x1,y1"):
             masks.in_box(points, box)
+
+
+def test_heaps_hardly_higher_than_the_ground_is_rough():
+    """Twelve heaps and pits of 0.3 m, on three tenths of a ground of waves half a metre high."""
+    middles = np.random.default_rng(3).uniform([0, 0], [180, 140], (12, 2))
+    reach = np.sqrt(0.3 * 180 * 140 / 12 / np.pi)
+
+    def scan(rng, height):
+        x, y = rng.uniform([0, 0], [180, 140], (20_000, 2)).T
+        z = 0.2 * x + 3 * np.sin(x / 16) * np.cos(y / 21) + 1.2 * np.sin(x / 6 - y / 5)
+        z += 0.5 * np.cos(x / 2.1) * np.sin(y / 2.7)
+        near = np.hypot(x[:, None] - middles[:, 0], y[:, None] - middles[:, 1]) < reach
+        z += np.where(near.any(axis=1), np.where(near.argmax(axis=1) % 2 == 0, height, -height), 0)
+        return np.column_stack([x, y, z]) + rng.normal(size=(20_000, 3)) * 0.03
+
+    source, reference = scan(np.random.default_rng(1), 0), scan(np.random.default_rng(2), 0.3)
+    found = register(source, moved(reference, TILT, SHIFT))
+    off = source @ (found.rotation - TILT).T + found.translation - SHIFT
+    assert np.linalg.norm(off, axis=1).max() < 0.03
+    assert "moved or changed" in found.notes[-1]

@@ -83,3 +83,33 @@ def test_every_reason_is_a_sentence(monkeypatch, name):
     told = verdict.reason(GOOD._replace(**{name: 0.001 if weight > 0 else 3.0}), (), 0.0)
     assert told[0].isupper() or told[0].isdigit()
     assert told.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("deviations_deg", "loose"), [((1.0, 1.0, 1.0), ""), ((2.0, 2.0, 2.0), "3.5 degrees")]
+)
+def test_a_rotation_known_to_a_few_degrees_is_held_loosely(deviations_deg, loose):
+    """Whatever the translation is known to, and however the axes lie."""
+    turn = Rotation.from_rotvec([0.3, 1.0, -0.4]).as_matrix()
+    covariance = np.diag([1e6] * 6)
+    covariance[:3, :3] = turn @ np.diag(np.radians(deviations_deg)) ** 2 @ turn.T
+    told = verdict.held_loosely(covariance)
+    assert loose in told
+    assert bool(told) == bool(loose)
+    assert not verdict.held_loosely(np.full((6, 6), np.nan))
+
+
+def test_two_scans_that_hardly_meet_are_no_success_and_told():
+    """Two strips of a bumpy ground with 2 % of its points in common, and noise."""
+    rng = np.random.default_rng(3)
+
+    def ground(first, last):
+        x, y = rng.uniform([first, 0], [last, 4], (6000, 2)).T
+        z = 0.3 * np.sin(2.1 * x) * np.cos(1.7 * y) + 0.1 * np.sin(5 * x + y)
+        return np.column_stack([x, y, z]) + rng.normal(size=(6000, 3)) * 0.02
+
+    source, reference = ground(0, 6.0), ground(5.7, 12)
+    found = register(source, reference, initial=np.eye(4))
+    assert verdict.rotation_deviation_deg(found.covariance) > 3
+    assert not found.success
+    assert found.reason
