@@ -105,7 +105,8 @@ def registered(
         judged += _judged(pair, _found_in_tiles(pair, config, known), config, known)
     if not judged:
         return surfaces.registered(source, reference, config, start, known)
-    judged += _judged(pair, _repeats(pair, _distinct(judged)[0].pose, known), config, known)
+    if start is None:
+        judged += _judged(pair, _repeats(pair, _distinct(judged)[0].pose, known), config, known)
     best, *others = _distinct(judged)
     poses = [frame.transform_in(best.problem.where, one.pose) for one in (best, *others)]
     scores = [one.score for one in others]
@@ -134,15 +135,15 @@ def _judged(
     judged = []
     for pose in poses:
         # What is covered under the refined pose may be more than it was before.
-        first = _judged_once(pair, pose, config, known)
-        again = first and _judged_once(pair, first.pose, config, known)
-        judged += [one for one in (again or first,) if one]
+        if first := _judged_once(pair, pose, config, known):
+            judged.append(_judged_once(pair, first.pose, config, known) or first)
     return judged
 
 
 def _judged_once(
     pair: Nested, pose: RigidTransform, config: RegisterConfig, known: Known
 ) -> _Judged | None:
+    """One pose, refined with what it covers itself; None if that is hardly anything."""
     if (piece := covered(pair, pose, config)) is None:
         return None
     problem = piece.problem(pair, config, known)
@@ -172,7 +173,11 @@ def _repeats(pair: Nested, pose: RigidTransform, known: Known) -> tuple[RigidTra
     found, _ = repeats.others(part, whole, here, axes=axes, most=_ALL_TILES)
     if pair.large == 0:
         found = se3.inverted(found)
-    return tuple(out_of(pair.clouds, RigidTransform(*one)) for one in zip(*found, strict=True))
+    allowed = rotation_angle_deg(found.rotation, np.eye(3)[None]) <= known.max_rotation_deg
+    return tuple(
+        out_of(pair.clouds, RigidTransform(found.rotation[i], found.translation[i]))
+        for i in np.flatnonzero(allowed)
+    )
 
 
 def _distinct(judged: list[_Judged]) -> list[_Judged]:

@@ -156,3 +156,6 @@ def test_a_box_in_a_scene_is_turned_by_half_as_well(large):
             for x in found
         ]
         assert min(off) < 0.3
+    limited = inside._repeats(pair, pose, Known(max_rotation_deg=100.0))
+    assert {angle_deg(x.rotation, np.eye(3)) <= 100 for x in limited} <= {True}
+    assert len(limited) < len(found)
