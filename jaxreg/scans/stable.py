@@ -29,7 +29,7 @@ _AROUND = 16
 """Points around a point that tell whether the surface moved there."""
 _STAYED, _MOVED = 1.25, 2.0
 """Where their median distance is so many times that of the noise, it did not, or it did."""
-_GAIN = 1.02
+_GAIN = 1.05
 """A pose is taken if so many times as many points agree with it: lie within half a noise level. Within
 one or three a pose that was drawn along a little agrees about as well as the right one."""
 _MORE = 1.2
