@@ -98,7 +98,8 @@ def known_of(
     """What the arguments of `register` say.
 
     Raises:
-      ValueError: a fact or an axis that does not exist, or an angle out of range.
+      ValueError: a fact or an axis that does not exist, an axis that is not known to be upright, or an
+        angle out of range.
     """
     facts = [facts] if isinstance(facts, str) else list(facts or ())
     for fact in facts:
@@ -110,6 +111,10 @@ def known_of(
             "for clouds in any orientation."
         )
     axis = _axis(up)
+    if "upright" not in facts and abs(axis @ UP) < 1 - _ROUNDING_DEG:
+        raise ValueError(
+            f"up={up!r} names the axis that both clouds have upwards: pass known='upright' as well."
+        )
     return Known(axis if "upright" in facts else None, "inside" in facts, max_rotation_deg or 180.0)
 
 

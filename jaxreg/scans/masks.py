@@ -43,7 +43,7 @@ def check_enough(taking_part: Bool[np.ndarray, "n"], name: str) -> None:
 
 
 def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
-    """How much every point of the source counts.
+    """How much every point of the source counts, of the one that counts most.
 
     Raises:
       ValueError: not a finite number of 0 or more for each row.
@@ -61,7 +61,7 @@ def weights_of(weights: object, count: int) -> Float[np.ndarray, "n"]:
     if wrong.any():
         row = int(np.argmax(wrong))
         raise ValueError(f"weight {row} is {array[row]}: give finite numbers of 0 or more.")
-    return array
+    return array / (array.max() or 1.0)
 
 
 def of_points(values: Float[np.ndarray, "n"], cloud: Prepared) -> Float[np.ndarray, "p"]:

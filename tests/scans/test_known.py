@@ -98,3 +98,11 @@ def test_a_pose_beyond_the_limit_is_no_success():
     assert found.probability == 0
     assert found.reason
     assert register(cloud, moved(cloud, turn, np.zeros(3)), max_rotation_deg=45).success
+
+
+def test_an_axis_that_is_not_known_to_be_upright_is_an_error():
+    points = np.eye(3)
+    for up in ("y", (0.0, 1.0, 1.0)):
+        with pytest.raises(ValueError, match="pass known='upright' as well"):
+            register(points, points, up=up)
+    assert known.known_of(None, "z", None).up is None

@@ -121,6 +121,13 @@ def test_a_mask_and_a_weight_of_zero_say_what_moved():
     assert error(weights=stays.astype(float)) < 0.2
 
 
+def test_only_the_proportions_of_weights_count():
+    given = np.random.default_rng(4).uniform(0.5, 1, 50)
+    for factor in (1e-300, 1e300):
+        np.testing.assert_allclose(masks.weights_of(factor * given, 50), given / given.max())
+    np.testing.assert_array_equal(masks.weights_of(np.zeros(3), 3), 0)
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
